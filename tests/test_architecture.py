@@ -99,6 +99,7 @@ def wrong_import(room: str, module: str) -> bool:
     return target not in ARROWS[room] | {room, "core"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("room", sorted({room_of(file) for file in LIBRARY}))
 def test_imports_follow_the_arrows(room: str) -> None:
     wrong = [f"{name(file)}:{line}: {room} must not import {module}" for file in LIBRARY if room_of(file) == room
@@ -140,6 +141,7 @@ def test_no_file_stands_in_a_circle() -> None:
     assert not taken, f"these import each other: {sorted(taken)}"
 
 
+@pytest.mark.long
 def test_tests_share_only_what_lies_in_support() -> None:
     wrong = []
     for file in TESTS:

@@ -80,6 +80,7 @@ NAMES = (
 )  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_another_type_is_one_error(name, mapped, image_folder, fake_odometry):
     """Never a TypeError or an AttributeError from within; None is taken where the annotation says so."""

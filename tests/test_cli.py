@@ -54,6 +54,7 @@ def test_a_wrong_setting_is_bad_input(setting, image_folder, tmp_path, capsys):
     assert "patches" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_an_odometry_without_weights(tmp_path, capsys):
     """``--system`` in place of ``--weights``, with settings of its own."""
     sequence = make_sequence(4, frames=12, family="room", kind="sideways", height=120, width=160, fps=15.0)
@@ -281,6 +282,7 @@ def test_package_names_are_lazy_and_complete():
         _ = dvo.no_such_thing
 
 
+@pytest.mark.long
 def test_ctrl_c_at_a_terminal(image_folder, tmp_path, repository):
     """The real signal, a real process: a slow odometry, interrupted from outside."""
     script = tmp_path / "slow.py"

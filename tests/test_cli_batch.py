@@ -161,6 +161,7 @@ def test_results_of_dvo_run_count(tracked, videos, tmp_path):
     assert main(line(videos, out)) == 0 and tracked == ["two", "three"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -347,6 +348,7 @@ OPTIONS = st.fixed_dictionaries(
 )  # fmt: skip
 
 
+@pytest.mark.long
 @examples(options=OPTIONS)
 def test_options_pass_through_a_command_line(options):
     arguments = build_parser().parse_args(["run", *as_arguments(options), "--", "-clip.mp4"])

@@ -34,6 +34,7 @@ def folder(tmp_path):
     return images
 
 
+@pytest.mark.long
 def test_calibrates_and_runs_with_the_file(folder, tmp_path, capsys, monkeypatch, fake_odometry):
     out = tmp_path / "out"
     assert main(["calibrate", str(folder), "--board", "5x4", "--square", "0.03", "--out", str(out)]) == 0
@@ -60,6 +61,7 @@ def test_a_fisheye_is_written_as_yaml(folder, tmp_path, capsys):
     assert dvo.open(folder, calib=out / "calib.yaml").recorded_camera.model == "fisheye"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "match"),
     [

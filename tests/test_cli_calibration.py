@@ -85,6 +85,7 @@ def test_the_file_of_an_earlier_run_stays_if_it_is_given(image_folder, tmp_path,
     assert (out / "calib.txt").is_file() and len(calibrated) == 1
 
 
+@pytest.mark.long
 def test_images_that_tell_nothing_are_tracked_with_the_guess(image_folder, tmp_path, capsys):
     """With the real network: images of noise."""
     out = tmp_path / "out"

@@ -45,6 +45,7 @@ def test_every_kernel_is_there_with_as_many_arguments(name):
     assert len(types) == len(inspect.signature(getattr(import_module(module), function).py_func).parameters)
 
 
+@pytest.mark.long
 def test_kernels_are_imported_without_torch():
     modules = sorted({name.split(":")[0] for name in KERNELS})
     program = (

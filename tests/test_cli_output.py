@@ -262,6 +262,7 @@ def test_status_as_text():
     assert describe_status(Estimate(0.0, np.ones(7), Status.TRACKING)) == "tracking"
 
 
+@pytest.mark.long
 def test_the_picture_shows_segments_apart(given, image_folder, tmp_path):
     """Without ground truth a panel each, with it one panel in which every segment has its colour."""
     given(plots=True, new_segment=(6, 13))

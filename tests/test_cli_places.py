@@ -305,6 +305,7 @@ def test_a_device_stays_a_device(given, image_folder, tmp_path, capsys, option, 
     assert place.stat().st_mode == mode
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["run.json", "batch.csv", "logs/walk.log", "walk/run.json", "calib.txt"])
 def test_a_pipe_of_the_name_of_a_result_ends_no_command_waiting(given, video, tmp_path, capsys, name):
     given()

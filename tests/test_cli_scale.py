@@ -81,6 +81,7 @@ def clip(tmp_path):
 SETTINGS = ["--set", "pixels=19200", "--set", "estimate_readout=false", "--device", "cpu"]
 
 
+@pytest.mark.long
 def test_a_run_with_depth_is_in_metres(clip, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["run", str(clip), "--out", str(out), *SETTINGS, "--depth"]) == 0
@@ -93,6 +94,7 @@ def test_a_run_with_depth_is_in_metres(clip, tmp_path, capsys):
     assert (out / "cloud.ply").stat().st_size > 1000
 
 
+@pytest.mark.long
 def test_a_run_with_right_images_is_in_metres(clip, tmp_path, capsys):
     """The right camera 0.1 m beside the left one sees what that one sees two frames later."""
     names = sorted(file.name for file in (clip / "rgb").iterdir())
@@ -113,6 +115,7 @@ def test_a_run_with_right_images_is_in_metres(clip, tmp_path, capsys):
     assert not (out / "cloud.ply").exists()
 
 
+@pytest.mark.long
 def test_a_run_with_a_distance_is_in_metres_and_one_that_is_not_covered_is_told(clip, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["run", str(clip), "--out", str(out), *SETTINGS, "--distance", "0.2", "1.2", "0.5"]) == 0

@@ -57,6 +57,7 @@ print(json.dumps(codes))
 """
 
 
+@pytest.mark.long
 def test_kill_loses_no_tracked_frame(image_folder, tmp_path, repository):
     """Rows that had been recorded when the process was killed are there; no frame is missing, so no second is. SIGTERM,
     the last of the signals, ends with all results."""

@@ -41,6 +41,7 @@ def is_clean(text: str) -> bool:
     return not any(unicodedata.category(c) in ("Cc", "Cf") and c != "\n" for c in text)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("address", ADDRESSES)
 def test_errors_hold_no_password(address, image_folder, tmp_path, capsys):
     lines = [
@@ -91,6 +92,7 @@ def test_files_of_a_stream_hold_no_password(given, monkeypatch, tmp_path, capsys
     assert not any(secret in text for text in texts for secret in ("Xq9", "w0rd", "admin"))
 
 
+@pytest.mark.long
 def test_names_of_files_and_arguments_are_escaped(given, image_folder, tmp_path, monkeypatch, capsys):
     given()
     folder = tmp_path / f"{HOSTILE}\n\rdvo: forged"
@@ -161,6 +163,7 @@ def test_names_in_a_results_folder_are_escaped(given, image_folder, tmp_path, ca
     assert is_clean(said.out) and is_clean(said.err) and ESCAPED in said.err and f"{ESCAPED} [red]<b>" in said.out
 
 
+@pytest.mark.long
 def test_doctor_and_synth(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("DVO_DATA", HOSTILE)
     monkeypatch.setenv("DVO_CACHE", f"http://admin:Xq9@{HOSTILE}")

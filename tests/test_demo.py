@@ -17,6 +17,7 @@ from dvo.demo import _frames, render_clip
 from dvo.synth.sequence import make_sequence
 
 
+@pytest.mark.long
 def test_the_clip_is_the_same_every_time_and_moves():
     first, second = render_clip(5), render_clip(5)
     assert first.frame_count == 5 and first.groundtruth is not None
@@ -47,6 +48,7 @@ def test_threads_render_what_one_does_and_stop_when_asked_to(monkeypatch):
     assert len(rendered) < 20
 
 
+@pytest.mark.long
 def test_demo_reports_the_error_against_ground_truth(monkeypatch, fake_odometry, tmp_path, capsys):
     truth = render_clip(12).groundtruth
     assert truth is not None

@@ -81,6 +81,7 @@ def test_forward_is_x_left_is_y_and_up_is_z():
     assert np.allclose(state.T_odom_base, [1, 2, 3, 0, 0, np.sin(0.1), np.cos(0.1)])  # a turn to the left
 
 
+@pytest.mark.long
 @given(xi=vectors, extrinsics=vectors, direction=vectors)
 def test_covariance_is_that_of_position_and_turn_in_the_axes_of_odom(xi, extrinsics, direction):
     """The covariance of one known error is its outer product."""

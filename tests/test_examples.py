@@ -34,6 +34,7 @@ def test_every_example_is_run_here():
     assert all(f'"{script.name}' in text for script in EXAMPLES.glob("*.py"))
 
 
+@pytest.mark.long
 def test_quick_start(tmp_path):
     out = run(EXAMPLES / "quick_start.py", "--frames", "16", "--out", "plot.png", cwd=tmp_path)
     assert "16 of 16 frames" in out and re.search(r"ATE \d", out)
@@ -75,18 +76,21 @@ def test_fine_tune(tmp_path):
     assert "gives dvo-tuned" in out and len(re.findall(r"^step \d: loss \d", out, re.MULTILINE)) == 2
 
 
+@pytest.mark.long
 def test_bundle_adjustment_in_training(tmp_path):
     out = run(EXAMPLES / "bundle_adjustment_in_training.py", cwd=tmp_path)
     first, last = map(float, re.findall(r"third ([\d.]+)", out))
     assert last < 0.6 * first
 
 
+@pytest.mark.long
 def test_train_inertial(tmp_path):
     out = run(EXAMPLES / "train_inertial.py", cwd=tmp_path)
     first, last = map(float, re.findall(r"third ([\d.]+)", out))
     assert last < 0.7 * first
 
 
+@pytest.mark.long
 def test_own_odometry_alone(tmp_path):
     assert "ATE" in run(EXAMPLES / "own_odometry.py", cwd=tmp_path)
 

@@ -151,6 +151,7 @@ def done(recording, tmp_path_factory):
     return SimpleNamespace(told=told, folder=folder)
 
 
+@pytest.mark.long
 def test_export_in_a_format_of_the_package(done):
     assert "4 poses" in done.told["export"]
     times = np.arange(4) / 10
@@ -158,14 +159,17 @@ def test_export_in_a_format_of_the_package(done):
     np.testing.assert_allclose(found, np.column_stack([times, 2 * times, 0 * times]))
 
 
+@pytest.mark.long
 def test_parts_are_announced_without_a_call(done):
     assert done.told["announced"] == str([True] * 10)
 
 
+@pytest.mark.long
 def test_the_update_operator_is_chosen_by_a_word(done):
     assert done.told["update operator"] == "Still True"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_train_export_and_run(recording, tmp_path):
     """Task, network, odometry and reader: trained, exported and tracked by the ordinary commands."""
@@ -192,6 +196,7 @@ def test_train_export_and_run(recording, tmp_path):
     assert facts["kind"] == "array" and facts["odometry"] == "dvo-distance" and facts["frames"]["tracked"] == 6
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_system_is_evaluated_beside_the_others(recording, tmp_path):
     sequence = {"name": "walk", "path": "walk", "groundtruth": "groundtruth.txt"}
@@ -207,28 +212,34 @@ def test_the_system_is_evaluated_beside_the_others(recording, tmp_path):
     assert "end error m" in (tmp_path / "runs" / "table.md").read_text()
 
 
+@pytest.mark.long
 def test_a_sequence_is_judged_by_the_metric(done):
     assert done.told["metric"] == "end_error"
 
 
+@pytest.mark.long
 def test_a_calibration_of_the_dialect_is_read(done):
     camera = json.loads((done.folder / "focal" / "run.json").read_text())["camera"]
     assert [camera[name] for name in ("fx", "fy", "cx", "cy")] == [60, 60, 31.5, 23.5]
 
 
+@pytest.mark.long
 def test_places_are_described_by_the_descriptor(done):
     assert done.told["place descriptor"] == "mean colour 3"
 
 
+@pytest.mark.long
 def test_the_sensor_takes_part_in_the_window(done):
     """It fixes the scale, its own unknowns come and go with the keyframes, and it has seen every frame."""
     assert done.told["sensor"] == "26 True True True"
 
 
+@pytest.mark.long
 def test_the_loss_term_is_in_the_loss_and_in_the_log(done):
     assert done.told["loss term"] == "True True"
 
 
+@pytest.mark.long
 def test_the_odometry_without_weights_tracks_on_the_command_line(done):
     """By its name, with a setting of its own; the reader is that of the package too."""
     poses = np.loadtxt(done.folder / "out" / "trajectory.txt")
@@ -236,6 +247,7 @@ def test_the_odometry_without_weights_tracks_on_the_command_line(done):
     assert done.told["odometry"] == "standing-still"
 
 
+@pytest.mark.long
 def test_the_scene_family_is_rendered(done):
     assert (done.folder / "shed.png").stat().st_size > 1000
 

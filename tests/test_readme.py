@@ -21,6 +21,7 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", README.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 
 
+@pytest.mark.long
 def test_python_block_runs(image_folder, monkeypatch):
     """On twenty small images of noise: the program must end, not track."""
     block = blocks("python")[0]

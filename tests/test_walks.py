@@ -97,6 +97,7 @@ def test_owner_of_a_phone(shell, filmed):
     assert (shell.folder / "again-tum" / "trajectory.txt").read_bytes() == (again / "trajectory.txt").read_bytes()
 
 
+@pytest.mark.long
 def test_owner_of_a_phone_who_mistypes(shell):
     """One line each, and no folder is left."""
     said = shell.type("dvo run vidoe.mp4", code=2)

@@ -82,6 +82,7 @@ def scipy_cost(path: Path) -> float:
     return optimize.least_squares(fun, x0, jac_sparsity=pattern, x_scale="jac", method="trf", ftol=1e-4).cost
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     [

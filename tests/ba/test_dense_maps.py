@@ -82,6 +82,7 @@ def test_the_plan_sums_what_the_sorted_one_sums():
     assert found[0] == found[1]
 
 
+@pytest.mark.long
 def test_gradients_are_the_derivatives():
     poses, depth, intrinsics, targets, weights, damping = problem(2, 3)
     ii, jj = PAIRS.unbind(1)
@@ -104,6 +105,7 @@ def test_strong_damping_holds_the_depth_of_its_pixel():
     assert moved[0, 1, 2, 3] < 1e-8 and moved[0, 1].median() > 1e-3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("index", [0, 2])
 def test_true_flow_gives_depth_and_motion(index):
     """From identity poses and constant depth, with two given poses, which set the scale."""

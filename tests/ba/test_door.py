@@ -231,6 +231,7 @@ def mixed(p: Any, tensors: tuple[Tensor, ...]) -> tuple[Factor, ...]:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("refine", ["none", "all"])
 def test_gradcheck_of_a_step_with_mixed_factors(problem: Maker, refine: str) -> None:
     p = problem(batch=1, frames=3, per_frame=2, noise=0.5)

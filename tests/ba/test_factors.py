@@ -33,6 +33,7 @@ def poses(seed: int, count: int = 4, size: float = 1.0) -> Tensor:
     return se3.exp(size * generator_of(seed)(1, count, 6))
 
 
+@pytest.mark.long
 @settings(max_examples=10, deadline=None)
 @given(seeds, st.sampled_from([1e-6, 0.1, 0.8]))
 def test_jacobians_of_priors_and_relative_poses(seed: int, size: float) -> None:

@@ -35,6 +35,7 @@ def layer_of(
     return f, tuple(x.clone().requires_grad_() for x in inputs)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "options",
     [

@@ -154,6 +154,7 @@ def assert_found(window: InertialWindow, found: dict[str, Tensor], exact: bool =
     torch.testing.assert_close(found[IMU_BIAS][..., 3:], window.biases[..., 3:], atol=1e-3 * near, rtol=0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dtype", [F64, torch.float32])
 def test_a_window_finds_scale_gravity_biases_time_offset_and_extrinsics(dtype: torch.dtype) -> None:
     window = inertial_window(1, late=0.001)
@@ -168,6 +169,7 @@ def test_a_window_finds_scale_gravity_biases_time_offset_and_extrinsics(dtype: t
     assert_found(window, dict(result.blocks), exact=dtype == F64)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dtype", [F64, torch.float32])
 def test_the_global_adjustment_finds_them_too(dtype: torch.dtype) -> None:
     window = inertial_window(1, late=0.001)

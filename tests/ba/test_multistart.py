@@ -137,6 +137,7 @@ class Given:
         return self.outcome
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("starts", [RESTARTS, DEPTH_STARTS, {PRESENT: present, **COLD_STARTS}], ids=len)
 @pytest.mark.parametrize("begun", [(True, True), (True, False), (False, False)])
 def test_solutions_are_the_same_with_a_part_beside(starts, begun):

@@ -44,6 +44,7 @@ def random_graph(dim: int, seed: int, angle: float = 0.6) -> tuple[Tensor, Tenso
     return group.exp(tangent[:5]), ii, jj, group.exp(tangent[5:11])
 
 
+@pytest.mark.long
 @settings(max_examples=15)
 @given(st.sampled_from([6, 7]), st.sampled_from(CHARTS), st.integers(0, 10_000))
 def test_jacobians_are_those_of_autograd(dim: int, chart: Chart, seed: int):
@@ -81,6 +82,7 @@ def test_the_residual_is_that_of_the_factor():
     torch.testing.assert_close(linear.jacobians[1][0], -j_j)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("solver", ["direct", "cg"])
 @pytest.mark.parametrize("dim", [6, 7])
 def test_the_minimum_is_that_of_scipy(dim: int, solver: str):
@@ -192,6 +194,7 @@ def with_solver(solver: str, **changes: object) -> PoseGraphOptions:
     return PoseGraphOptions(solver=LMOptions(max_iterations=200, tolerance=1e-12, solver=solver), **changes)  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kernel", [Kernel("none"), Kernel("huber", 1.0), Kernel("cauchy", 2.0)])
 @pytest.mark.parametrize("dim", [6, 7])
 def test_both_factorisations_end_at_the_same_chi2(dim: int, kernel: Kernel):
@@ -306,6 +309,7 @@ def test_edges_in_the_plane_are_those_in_space(chart: Chart, seed: int, size: fl
         torch.testing.assert_close(own[keep], full[keep], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("outside", [0.0, 1.0, 1e12])
 def test_a_graph_in_the_plane_does_not_depend_on_information_outside_it(outside: float):
     poses, ii, jj, measured, information = drifted()
@@ -416,6 +420,7 @@ def arguments(graph: PoseGraph) -> tuple[Tensor, ...]:
 
 # Final errors of GTSAM 4.3.0 (Levenberg-Marquardt, relative and absolute tolerance 1e-10), times two. GTSAM takes the
 # information of a file as that of the logarithm.
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "chi2"),
     [

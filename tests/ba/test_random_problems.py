@@ -211,6 +211,7 @@ def wrong_again(total: Tensor, leaves: dict[str, Tensor]) -> list[str]:
 SETTINGS = settings(deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None)
 
 
+@pytest.mark.long
 @settings(SETTINGS, max_examples=200)
 @given(st.data())
 def test_random_problems(data: st.DataObject) -> None:

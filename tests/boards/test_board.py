@@ -17,6 +17,7 @@ def truth(scene, pose, points):
     return distort(seen[:, :2] / seen[:, 2:], camera) * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [1, 3], ids=["small", "large"])
 def test_corners_of_a_checkerboard(boards, scale):
     """Those of a large image too, which is searched at reduced size."""

@@ -24,6 +24,7 @@ def scene_of(boards, lens, board):
     return boards.Scene(getattr(boards, lens), boards.checkerboard(7, 5))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
 def test_known_cameras_are_recovered(boards, case, tmp_path):
     lens, board, settings = CASES[case]
@@ -74,6 +75,7 @@ def test_no_board_too_few_views_no_frames(boards):
         calibrate_board([], Checkerboard(7, 5))
 
 
+@pytest.mark.long
 def test_doubts_are_told(boards):
     scene = boards.Scene(boards.RADTAN, boards.checkerboard(7, 5))
     found = calibrate_board(scene.frames(scene.poses(8, near=20.0, far=22.0)), Checkerboard(7, 5))

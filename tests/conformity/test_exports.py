@@ -110,6 +110,7 @@ def test_evo_reads_trajectories(format: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(theirs.timestamps, given.timestamps, atol=1e-6, rtol=0)
 
 
+@pytest.mark.long
 def test_tum_layout(sequence: SyntheticSequence, tmp_path: Path) -> None:
     """Its documentation: lists of ``timestamp filename``, 16-bit depth of 5000 to a metre, poses that evo reads."""
     interface = pytest.importorskip("evo.tools.file_interface", reason="evo is in the extra 'eval'")
@@ -130,6 +131,7 @@ def test_tum_layout(sequence: SyntheticSequence, tmp_path: Path) -> None:
     assert np.median(distance) < 0.05 * np.median(np.linalg.norm(clouds[0] - theirs.positions_xyz[0], axis=1))
 
 
+@pytest.mark.long
 def test_tartanair_layout(sequence: SyntheticSequence, tmp_path: Path) -> None:
     """Its documentation: depth in metres, camera x forward, y right, z down, flow in pixels with a mask that is 0 where
     it is valid: points of one frame, moved by the poses, land where the flow says."""

@@ -30,6 +30,7 @@ def pair(seed: int) -> tuple[Trajectory, Trajectory]:
     return truth, Trajectory(truth.timestamps[kept] + rng.uniform(-0.004, 0.004, 65), estimate[kept])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("align", ["none", "scale", "se3", "sim3"])
 @pytest.mark.parametrize("gap", [1, 5])
 @pytest.mark.parametrize("seed", range(3))

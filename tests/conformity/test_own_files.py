@@ -89,6 +89,7 @@ def test_rendered_sequences(layout: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(*(np.linalg.inv(p[0]) @ p for p in poses), atol=1e-5)
 
 
+@pytest.mark.long
 def test_maps(tmp_path: Path) -> None:
     """Keyframes, points and trajectory of a tracker, by ``dvo.load_map`` and as a graph; and saved again."""
     weights = network("patch_vo")

@@ -68,12 +68,14 @@ def test_twins_on_request(monkeypatch):
         use_kernels(torch.zeros(3))
 
 
+@pytest.mark.long
 def test_without_numba_one_line_says_so():
     found = subprocess.run([sys.executable, "-c", HIDDEN], cwd=ROOT, capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "False False"
     assert found.stderr.count("numba cannot be imported") == 1
 
 
+@pytest.mark.long
 def test_compiled_once_with_a_line(tmp_path):
     file = tmp_path / "some_kernels.py"
     file.write_text(KERNEL)
@@ -84,6 +86,7 @@ def test_compiled_once_with_a_line(tmp_path):
         assert found.stderr.count("compiling kernels") == said
 
 
+@pytest.mark.long
 def test_a_cache_that_is_damaged_or_cannot_be_written_is_none(tmp_path):
     file, cache = tmp_path / "some_kernels.py", tmp_path / "cache"
     file.write_text(KERNEL)

@@ -12,6 +12,7 @@ import pytest
 from dvo.core.processes import StoppedError, begin, close, run_limited
 
 
+@pytest.mark.long
 def test_time_limit_ends_the_children_too(tmp_path):
     begin()
     script = f"sleep 600 & echo $! > {tmp_path / 'child'}; echo before the end; wait"

@@ -19,6 +19,7 @@ PASSWORDS = st.text(st.characters(exclude_categories=("Cs",)), min_size=1, max_s
 SCHEMES = ("rtsp://", "RTSPS://", "http://", "rtmp://", "ftp://", "srt://", "rtps://", " rtsp://", "rtsp:/", "rtsp:///")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scheme", SCHEMES)
 @given(password=PASSWORDS)
 def test_no_password_is_left(scheme, password):
@@ -101,6 +102,7 @@ def test_what_steers_a_terminal_is_an_escape(text, shown):
     assert f"a{shown}b: f" in str(error)
 
 
+@pytest.mark.long
 @given(st.text())
 def test_nothing_that_steers_is_left(text):
     shown = visible(text)
@@ -136,6 +138,7 @@ def test_the_traceback_of_an_unknown_error_holds_no_secret(repository):
     assert "rtsp://admin:Xq9@host'\n" not in done.stderr and "\x1b" not in done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("start", ["x" * 10**5, "x " * 10**5, "a=" * 10**5, "aa:/" * 10**5, "'a:" * 10**5])
 def test_long_texts_come_to_an_end(start):
     """Names and files may be of any length."""

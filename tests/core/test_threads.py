@@ -134,6 +134,7 @@ def test_torch_imported_first():
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("module", ["dvo", "dvo.cli", "dvo.geometry.se3", "train", "eval", "tests.conftest"])
 def test_programs_wait_passively(module):
     """The choice is made before torch is imported, also if the environment sets the number of threads."""
@@ -141,6 +142,7 @@ def test_programs_wait_passively(module):
     assert said(code, OMP_NUM_THREADS="2") == ["PASSIVE"]
 
 
+@pytest.mark.long
 def test_openmp_reads_the_choice():
     """As OpenMP itself tells when it is loaded."""
     done = subprocess.run(

@@ -50,6 +50,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", REFUSED)
 def test_refused(case):
     text, message = REFUSED[case]

@@ -298,6 +298,7 @@ def test_a_run_keeps_what_was_tracked_before_a_bad_frame(fake_odometry, broken, 
         session.run(fake_odometry(), [broken, *good[4:]])
 
 
+@pytest.mark.long
 def test_the_tracker_goes_on_after_a_bad_frame_as_if_it_had_not_come():
     """Every kind of bad frame raises a DvoError; poses of good frames are those of a run without them."""
     config = TrackerConfig(pixels=64 * 48, patches=6, lifetime=4, removal=5, optimisation=4, initial_frames=5)

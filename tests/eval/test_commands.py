@@ -14,6 +14,7 @@ from eval.__main__ import main
 pytest.importorskip("evo", reason="evo is in the extra 'eval'")
 
 
+@pytest.mark.long
 def test_short_form_is_run(tmp_path, image_folder, suite_file, capsys, no_figures):
     out = tmp_path / "results"
     options = ["--suite", str(suite_file), "--data", str(tmp_path), "--out", str(out), "--systems", "null"]
@@ -31,6 +32,7 @@ def test_short_form_is_run(tmp_path, image_folder, suite_file, capsys, no_figure
     assert capsys.readouterr().out.count("**made for a test**") == 3
 
 
+@pytest.mark.long
 def test_runs_with_weights_of_a_file_are_labelled_by_it(tmp_path, image_folder, suite_file, capsys):
     weights = tmp_path / "night.safetensors"
     weights.write_bytes(b"none")
@@ -54,6 +56,7 @@ def test_benchmark_without_data_says_what_is_missing(tmp_path, capsys):
     assert str(tmp_path / "MH_01_easy") in lines[0] and len((tmp_path / "o/results.csv").read_text().splitlines()) == 12
 
 
+@pytest.mark.long
 def test_folder_of_ones_own(tmp_path, image_folder, capsys):
     clip = image_folder.parent
     write_tum(clip / "groundtruth_tum.txt", read_tum(clip / "truth.txt"))
@@ -94,6 +97,7 @@ def test_bad_folders_exit_2_with_one_line(tmp_path, capsys):
     assert "required: DIR" in error and "\n" not in error
 
 
+@pytest.mark.long
 def test_list(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("DVO_DATA", str(tmp_path))
     assert main(["list"]) == 0
@@ -103,6 +107,7 @@ def test_list(tmp_path, monkeypatch, capsys):
     assert main(["--list"]) == 0 and capsys.readouterr().out == told
 
 
+@pytest.mark.long
 def test_a_reader_that_has_seen_enough_ends_it_quietly(repository):
     process = subprocess.Popen(
         [sys.executable, "-u", "-m", "eval", "list"], cwd=repository, stdout=subprocess.PIPE, stderr=subprocess.PIPE

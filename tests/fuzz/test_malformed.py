@@ -19,6 +19,7 @@ from tests.fuzz.text import YAML
 SAMPLE = ["--cases", "50", "--jobs", "1"]  # one of each reader
 
 
+@pytest.mark.long
 def test_a_sample_fails_nowhere(repository):
     done = subprocess.run(
         [sys.executable, "-m", "tests.fuzz", *SAMPLE],

@@ -32,6 +32,7 @@ def test_refused_and_accepted(tmp_path):
     assert not list(tmp_path.glob("case*"))  # inputs are removed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
@@ -63,6 +64,7 @@ def test_memory_is_bounded(tmp_path):
     assert found["good", 0].verdict == "refused"
 
 
+@pytest.mark.long
 def test_a_refused_valid_input_and_a_failure_end_with_code_1(tmp_path, monkeypatch, capsys):
     # The limit is for the program in a process of its own; here its children begin with the memory of all tests so far.
     monkeypatch.setattr(worker, "Limits", partial(Limits, resident=10**10))

@@ -194,6 +194,7 @@ def test_a_point_far_out_is_found(model, coefficients, radius, expected):
     np.testing.assert_allclose(distort(found, camera), seen, atol=1e-9)
 
 
+@pytest.mark.long
 @ALL
 def test_images_are_undistorted(name):
     """A smooth pattern of the world through the lens, resampled, is that pattern through the pinhole."""

@@ -204,6 +204,7 @@ def test_the_kernel_projects_as_its_twin(
     assert found.coords.dtype == torch.float32
 
 
+@pytest.mark.long
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.integers(0, 10_000), st.integers(1, 2), st.sampled_from([0, 1, 7, 60]),

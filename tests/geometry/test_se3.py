@@ -72,6 +72,7 @@ def test_gradients_of_exp(angle: float) -> None:
     assert torch.autograd.gradcheck(se3.exp, tangents(angle, 3).requires_grad_())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("angle", ANGLES[:-1])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_gradients_of_log(angle: float, sign: float) -> None:

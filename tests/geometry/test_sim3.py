@@ -34,6 +34,7 @@ def test_exp_is_the_matrix_exponential_and_log_undoes_it(angle: float, sigma: fl
     torch.testing.assert_close(sim3.log(sim), xi, atol=1e-9, rtol=0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("angle", "sigma"), CASES)
 def test_gradients(angle: float, sigma: float) -> None:
     xi = tangents(angle, sigma, 2)

@@ -93,6 +93,7 @@ def test_new_camera_does_not_zoom_in_more_than_needed():
     assert smaller(np.full((480, 752), 255, np.uint8)).min() == 0
 
 
+@pytest.mark.long
 @LENSES
 def test_images_land_where_the_new_camera_says(camera):
     def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:  # of the world, in ideal normalised coordinates
@@ -127,6 +128,7 @@ def test_coefficients_that_fold_the_image_are_an_error():
         undistorted_camera(Camera(200, 200, 320, 240, 640, 480, "radtan", (-5.0, 0.0, 0.0, 0.0)))
 
 
+@pytest.mark.long
 @LENSES
 def test_depth_is_that_of_the_nearest_ray_and_never_in_between(camera):
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))

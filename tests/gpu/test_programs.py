@@ -36,6 +36,7 @@ def test_training_step(device):
     assert torch.nn.functional.cosine_similarity(there, gradient, dim=0) > 0.99
 
 
+@pytest.mark.long
 def test_rendering(device):
     here, there = (make_clip(0, 1, frames=2, height=48, width=64, device=where) for where in ("cpu", device))
     assert there.images.device.type == device.type

@@ -19,6 +19,7 @@ def on(device, values):
     return tuple(x.to(device) for x in values)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("scale", "channels"), [(1, 64), (4, 128)])
 def test_correlation(device, scale, channels):
     g = torch.Generator().manual_seed(0)
@@ -50,6 +51,7 @@ def test_correlation_of_frames(device):
     torch.testing.assert_close(found, expected, atol=2e-4, rtol=1e-4)
 
 
+@pytest.mark.long
 def test_alignment(device):
     g = torch.Generator().manual_seed(2)
     noise = torch.rand(4, 1, 24, 32, generator=g) * 255
@@ -72,6 +74,7 @@ OPTIONS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
 def test_window_solver(device, options):
     given = window_problem()
@@ -86,6 +89,7 @@ def test_window_solver(device, options):
             torch.testing.assert_close(x.cpu(), y, atol=1e-4, rtol=1e-3)
 
 
+@pytest.mark.long
 def test_gradients_of_the_layer(device):
     gradients = []
     for where in (device, torch.device("cpu")):

@@ -47,6 +47,7 @@ def test_the_factor_is_bounded_and_survives_a_checkpoint(losses):
     assert again == penalty and len(again.flow) == min(4, len(losses))
 
 
+@pytest.mark.long
 def test_gradcheck_of_the_weighted_loss():
     """The penalty is a constant: the gradient is that of the sum with fixed weights."""
     g = torch.Generator().manual_seed(0)

@@ -134,6 +134,7 @@ def test_everything_that_left_is_a_problem_that_bundle_adjustment_can_take():
     assert len(graph.log.trajectory()) == 6
 
 
+@pytest.mark.long
 def test_a_global_adjustment_of_the_archive_moves_frames_and_points_back():
     """Archived poses are disturbed; bundle adjustment of everything archived finds them again."""
     graph, poses = scene()

@@ -4,6 +4,7 @@ import gc
 import weakref
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -14,6 +15,7 @@ KINDS = st.sampled_from([np.uint8, np.int16, np.float16, np.float32, np.float64]
 ARRAYS = KINDS.flatmap(lambda kind: hnp.arrays(kind, hnp.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=9)))
 
 
+@pytest.mark.long
 @given(st.lists(ARRAYS, max_size=12), st.sampled_from([64, 256, 4096]))
 def test_arrays_are_kept_as_they_are(arrays, chunk):
     storage = ArrayStorage(chunk)

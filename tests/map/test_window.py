@@ -1,5 +1,6 @@
 """Renumbering of the window, and the motion measures."""
 
+import pytest
 import torch
 
 from dvo.geometry import se3
@@ -82,6 +83,7 @@ def test_prediction_goes_on_with_half_the_motion():
     torch.testing.assert_close(predict_pose(poses[:1], [0.0], 0.2, 0.5), a)
 
 
+@pytest.mark.long
 def test_rotation_has_flow_but_no_parallax():
     w = window(2)
     w.poses_cw[1] = se3.exp(torch.tensor([0, 0, 0, 0, 0.1, 0.0]))

@@ -186,6 +186,7 @@ def read_kitti(path: Path) -> Trajectory:
     return Trajectory(np.arange(len(matrices), dtype=float), np.column_stack([matrices[:, :, 3], quaternions]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("index", range(18))
 def test_agrees_with_the_stored_values_of_evo(data_root: Path, index: int):
     folder = data_root / "trajectories"
@@ -205,6 +206,7 @@ def test_agrees_with_the_stored_values_of_evo(data_root: Path, index: int):
         assert metrics.rpe_rot_deg == pytest.approx(rot["median"], abs=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["rgbdslam", "ORB_kf_mono"])
 @pytest.mark.parametrize("align", ["none", "scale", "se3", "sim3"])
 def test_agrees_with_evo_run_now(data_root: Path, name: str, align: Alignment):

@@ -64,6 +64,7 @@ def test_full_preset_is_the_published_network_tensor_for_tensor():
     assert (len(mine), sum(t.numel() for t in mine.values())) == (248, 24_509_482)
 
 
+@pytest.mark.long
 def test_an_imported_checkpoint_gives_the_published_outputs(state, tmp_path):
     torch.save(state, tmp_path / "tartanvo.pkl")
     info = import_checkpoint(tmp_path / "tartanvo.pkl", tmp_path / "full.safetensors")

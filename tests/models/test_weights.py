@@ -282,6 +282,7 @@ def test_unknown_setting_is_named():
     assert ModelConfig.from_dict(PRESETS["small"].to_dict()) == PRESETS["small"]
 
 
+@pytest.mark.long
 def test_loading_does_not_import_the_compiler_of_torch():
     names = ("small", "droid", "tartanvo", "deepvo")
     program = f"import sys, dvo; [dvo.load_model(name) for name in {names}]; assert 'torch._dynamo' not in sys.modules"

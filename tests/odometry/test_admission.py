@@ -72,6 +72,7 @@ def test_a_frame_that_may_not_be_tracked_is_refused(name):
     assert np.array_equal(second.map.points, first.map.points)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", EVERY)
 def test_an_image_without_content_is_lost_and_says_why(name):
     odometry, clip = build(name), frames(0, name)
@@ -89,6 +90,7 @@ def test_an_image_without_content_is_lost_and_says_why(name):
     assert not rows & {clip[0].timestamp, clip[1].timestamp, clip[7].timestamp}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [name for name in EVERY if name != "monoslam"])
 def test_a_repeated_image_has_the_pose_and_the_state_of_the_first(name):
     """MonoSLAM measures it: its filter has to learn that the camera stands."""

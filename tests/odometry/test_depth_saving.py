@@ -22,6 +22,7 @@ def with_depth(images):
     return [replace(f, depth=d.astype(np.float32)) for f, d in zip(images, depth, strict=True)]
 
 
+@pytest.mark.long
 def test_a_map_with_measured_depths(tmp_path):
     """Saved mid-way it is in metres already, also while a frame waits to be joined."""
     images = with_depth(frames(16))

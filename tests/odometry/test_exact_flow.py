@@ -64,6 +64,7 @@ def perfect(clip, config):
     return odometry
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("index", [0, *(pytest.param(index, marks=pytest.mark.slow) for index in (2, 6))])
 def test_exact_flow_gives_the_exact_trajectory(index):
     clip = make_clip(21, index, frames=40, height=96, width=128, flow_range=(2.0, 4.0), sensor=False)

@@ -47,6 +47,7 @@ def tracked(images, call=None):
     return odometry, *outcomes
 
 
+@pytest.mark.long
 def test_the_result_so_far_is_that_between_two_frames():
     images = frames(3)
     (alone,), (odometry, result) = tracked(images), tracked(images, PatchOdometry.current)
@@ -57,6 +58,7 @@ def test_the_result_so_far_is_that_between_two_frames():
     assert np.array_equal(odometry.finish().trajectory.poses_wc, alone.finish().trajectory.poses_wc)
 
 
+@pytest.mark.long
 def test_a_map_saved_by_another_thread_is_that_between_two_frames(tmp_path):
     images = frames(3)
     odometry, _ = tracked(images, lambda odometry: odometry.save(tmp_path / "map.dvo"))

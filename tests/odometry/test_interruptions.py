@@ -11,6 +11,7 @@ from dvo.odometry.load import build_odometry
 from tests.support.tiny_members import MEMBERS, SETTINGS, frames, network
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [*MEMBERS, "klt-pnp"])
 def test_a_clock_that_was_set_back_is_one_break_with_its_reason(name):
     """Ten seconds back in the middle; every frame after it is tracked."""

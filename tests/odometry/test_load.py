@@ -89,6 +89,7 @@ def test_shipped_weights_win_over_a_system_of_their_name():
         SYSTEMS.unregister("small")
 
 
+@pytest.mark.long
 def test_odometries_without_weights_are_loaded_by_name():
     sequence = make_sequence(4, frames=16, family="room", kind="sideways", height=120, width=160, fps=15.0)
     for name in ("keyframe", "klt-pnp", "direct", "monoslam", "msckf"):

@@ -44,6 +44,7 @@ def alone():
     return run(dvo.load("small"), frames(10))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CONTEXTS)
 def test_the_settings_of_the_program_change_no_byte(alone, name):
     expected, result = alone
@@ -64,6 +65,7 @@ def poses_alone(system):
     return poses_of(system)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CONTEXTS)
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_systems_without_weights_do_not_mind_either(system, name):

@@ -53,6 +53,7 @@ def test_measurements_in_ignored_pixels_have_no_weight():
     assert bool((measured(window, window.confidence, into) == (into & seen)).all())
 
 
+@pytest.mark.long
 def test_a_mask_that_ignores_nothing_changes_nothing():
     assert outcome(tracker(), masked(frames(1), np.ones((72, 96), bool))) == outcome(tracker(), frames(1))
 

@@ -23,6 +23,7 @@ def maps(tmp_path_factory):
     return folder, [walk, back.finish()], truth
 
 
+@pytest.mark.long
 def test_two_maps_of_a_place_become_one(maps, tmp_path, capsys):
     folder, (walk, back), truth = maps
     out = tmp_path / "both.dvo"
@@ -43,6 +44,7 @@ def test_two_maps_of_a_place_become_one(maps, tmp_path, capsys):
         merge_maps(folder / "walk.dvo", out)
 
 
+@pytest.mark.long
 def test_maps_of_two_places_are_not_merged(maps, tmp_path, capsys):
     out = tmp_path / "both.dvo"
     assert main(["merge", str(maps[0] / "walk.dvo"), str(maps[0] / "street.dvo"), "--out", str(out)]) == 1
@@ -50,6 +52,7 @@ def test_maps_of_two_places_are_not_merged(maps, tmp_path, capsys):
     assert "no place of" in line and "nothing is written" in line and not out.exists()
 
 
+@pytest.mark.long
 def test_maps_that_cannot_be_compared(maps, tmp_path, capsys):
     walk = maps[0] / "walk.dvo"
     odometry = dvo.load("small", device="cpu", patches=12, pixels=160 * 120)

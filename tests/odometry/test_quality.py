@@ -28,6 +28,7 @@ def result_of(frames, **settings):
     return dvo.run(dvo.load("small", device="cpu", seed=0, **settings), frames).result
 
 
+@pytest.mark.long
 def test_a_good_result(film):
     quality = result_of(film).quality
     assert quality.verdict == "good" and not quality.reason and not quality.remedy and str(quality) == "good"
@@ -36,6 +37,7 @@ def test_a_good_result(film):
     assert quality.initialised_at > film[0].timestamp and quality.fixed == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "number"),
     [pytest.param(with_crowd, 0, marks=pytest.mark.slow), pytest.param(with_waves, 0, marks=pytest.mark.slow),
@@ -47,6 +49,7 @@ def test_a_failure_is_not_good(film, change, number):
     assert quality.verdict == "doubtful" and quality.reason and quality.remedy
 
 
+@pytest.mark.long
 def test_motion_before_a_still_camera_is_not_good(film):
     quality = result_of(before_still_camera(np.random.default_rng(0), film, 1)).quality
     assert quality.verdict in ("doubtful", "failed")
@@ -70,6 +73,7 @@ def test_a_tripod_fails(film):
     assert result.quality.verdict == "failed" and "too little motion" in result.quality.reason
 
 
+@pytest.mark.long
 def test_standing_still_after_the_start_is_good(film):
     rng = np.random.default_rng(0)
     stand = [(film[19].image + rng.normal(0, 2, film[0].image.shape)).clip(0, 255).astype(np.uint8) for _ in range(16)]

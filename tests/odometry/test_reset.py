@@ -33,6 +33,7 @@ def test_the_next_sequence_has_the_bytes_of_a_new_odometry(name, finished):
         assert np.array_equal(before.trajectory.poses_wc, kept) and len(kept)
 
 
+@pytest.mark.long
 def test_the_tracker_of_a_map_begins_without_it(tmp_path):
     weights, images = network("patch_vo"), frames(1)
     odometry = build_odometry(weights, **SETTINGS["patch_vo"])

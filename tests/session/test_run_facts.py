@@ -82,6 +82,7 @@ def outcome(folder, capsys, *commands) -> list[int]:
     return codes
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("value", [MISSING, 10**400, "\ud800", [None], {"x": {"y": [1]}}], ids=lambda v: str(v)[:12])
 def test_entries_at_the_top(folder, capsys, value):
     values = json.loads((folder / "run.json").read_text())
@@ -105,6 +106,7 @@ def test_every_entry(folder, capsys):
     assert 0 < codes.count(2) < len(codes)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("place", "value", "said"),
     [
@@ -133,6 +135,7 @@ def test_the_error_names_the_entry(folder, capsys, place, value, said):
     assert said in str(raised.value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("text", ["", "[]", "{", "null", "[" * 100000, '{"a": ' * 100000, "\ud800", "1" * 5000, "{}"])
 def test_what_is_no_run(folder, capsys, text):
     (folder / "run.json").write_bytes(text.encode("utf-8", "surrogatepass"))
@@ -157,6 +160,7 @@ def damaged(data: bytes, seed: int) -> bytes:
     return (b" " if kind == 2 else b",").join(words)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["frames.csv", "trajectory.txt", "trajectory-1.txt", "map.ply"])
 def test_other_damaged_files(folder, capsys, name):
     whole = (folder / name).read_bytes()
@@ -177,6 +181,7 @@ def test_extreme_points_of_a_map(folder, capsys, value):
     outcome(folder, capsys)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "row", ["10,tracking,0,,,,,1e13,0,0,,", "1e300,tracking,0,,,,,,,,,", "10,tracking,-2,,,,,,,,,", "10,x,,,,,,,,,,",
             "10,tracking,99999999999999999999,,,,,,,,,", "10,lost,,,,,\x1b[2J,,,,,", ",lost,,,,,,,,,,"],

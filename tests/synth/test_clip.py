@@ -135,6 +135,7 @@ def test_clips_that_are_not_chosen_keep_their_bytes(clips: list[Clip]) -> None:
     assert digest(parts(clip)) != digest(parts(clips[changed]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("index", [1, 4, 7])
 def test_depth_is_nan_where_a_body_is_seen(index: int) -> None:
     """The static scene shows through everywhere else, and is farther away where a body is seen."""
@@ -163,6 +164,7 @@ def test_bodies_move_and_are_the_same_for_the_same_seed() -> None:
     assert not torch.equal(clip.moving[0], clip.moving[-1])
 
 
+@pytest.mark.long
 def test_depth_is_nan_where_surroundings_are_seen() -> None:
     """Nothing else changes, and clips that are not chosen keep their bytes."""
     options = {"sensor": False, **SMALL}
@@ -188,6 +190,7 @@ def test_depth_is_nan_where_surroundings_are_seen() -> None:
     assert 0 < shown < 8
 
 
+@pytest.mark.long
 def test_the_crop_of_some_clips_floats_and_their_intrinsics_say_so() -> None:
     """Pixels of one frame, carried by depth, pose and intrinsics, have the same colours in another."""
     options = {"sensor": False, "height": 120, "width": 160, "frames": 4, "flow_range": (1.0, 3.0)}
@@ -229,6 +232,7 @@ def test_what_would_cover_everything_is_left_out() -> None:
     assert 0 < len(shown) < 30 and all(float(moving.float().mean((1, 2)).max()) <= 0.8 for moving in shown)
 
 
+@pytest.mark.long
 def test_bare_and_blurred_clips_show_less_of_the_same_scene() -> None:
     def contrast(images: torch.Tensor) -> float:
         return float(images.float().diff(dim=-1).abs().mean())

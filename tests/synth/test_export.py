@@ -99,6 +99,7 @@ def test_mesh_sequence_reads_back_with_the_background_as_no_depth(tmp_path: Path
     assert np.array_equal(again.frame(2).image, sequence.frame(2).image)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("lens", "noise"), [("radtan", None), ("fisheye", NOISE_PRESETS["phone"])])
 def test_euroc_layout_reads_back(lens: str, noise: ImuNoise | None, tmp_path: Path) -> None:
     """Images, camera, times, poses and every inertial sample are those that were rendered."""
@@ -144,6 +145,7 @@ def test_export_refuses_what_it_cannot_do(sequence: SyntheticSequence, tmp_path:
         export_sequence(sequence, tmp_path / "new", "kitti")  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = str(tmp_path / "P001")
     size = ["--size", "64x48", "--frames", "2"]

@@ -90,6 +90,7 @@ def test_sequences_without_effects_keep_their_bytes(plain: SyntheticSequence) ->
     assert torch.equal(plain.rendering(0).images, bare.images) and torch.equal(plain.rendering(0).depth, bare.depth)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", EFFECTS)
 def test_same_seed_same_bytes_whatever_the_effect(plain: SyntheticSequence, name: str) -> None:
     first, second = (make_sequence(SEED, **SMALL, **EFFECTS[name]) for _ in range(2))
@@ -100,6 +101,7 @@ def test_same_seed_same_bytes_whatever_the_effect(plain: SyntheticSequence, name
     assert not np.array_equal(first.frame(5).image, plain.frame(5).image), "the effect has no effect"
 
 
+@pytest.mark.long
 def test_workers_do_not_change_frames() -> None:
     alone = torch.stack([_Frames()[i] for i in range(4)])
     threads = torch.get_num_threads()

@@ -23,6 +23,7 @@ def level(height=2.0, time=0.0, depth=6.0):
     return Canvas(np.full((60, 80, 3), 0.5), np.full((60, 80), depth), pose, CAMERA, time)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SURROUNDINGS)
 def test_what_it_covers_is_marked_and_nothing_else_changes(name):
     plain, with_it = sequence(""), sequence(name)
@@ -72,6 +73,7 @@ def test_names_that_are_not_known_are_refused(names):
         sequence(names)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [name for name in SURROUNDINGS if name != "snow"])  # flakes have neither
 def test_training_clips_show_other_pictures_than_sequences(name):
     """No suite shows a texture or an outline that a network was trained on."""

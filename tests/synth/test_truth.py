@@ -48,6 +48,7 @@ def make_shot(
     return Shot(stage, path, camera, exposure, readout)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
 def test_flow_lands_on_the_same_surface_and_texture_coordinate(scene: Scene, case: str) -> None:
     """A pixel moved by the flow hits, in float64, the surface and the spot on it that it showed before."""
@@ -74,6 +75,7 @@ def test_flow_lands_on_the_same_surface_and_texture_coordinate(scene: Scene, cas
     assert np.linalg.norm(again - target[same], axis=-1).max() < 1e-3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
 def test_flow_there_and_back_agree(scene: Scene, case: str) -> None:
     """A point seen by both frames flows back to where it came from, and is visible from there too."""
@@ -146,6 +148,7 @@ def test_occluded_pixels_are_hidden_by_something_nearer(scene: Scene) -> None:
     assert (seen[~one_sided] < z[chosen][~one_sided]).all() and one_sided.mean() < 0.5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", ["bodies", "both"])
 def test_tracks_follow_surface_points(scene: Scene, case: str) -> None:
     shot = make_shot(scene, **CASES[case])

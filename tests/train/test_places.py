@@ -9,6 +9,7 @@ from dvo.odometry.loops.place_descriptors import load_descriptor
 from dvo.synth.scenes.families import HELD_OUT, SHARES
 
 
+@pytest.mark.long
 def test_the_command_writes_the_same_file_again(tmp_path, monkeypatch):
     families = []
     make = train.places.make_sequence

@@ -34,6 +34,7 @@ def test_no_line_is_drawn_across_a_gap():
     assert np.isfinite(with_gaps(whole)).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [0, 1, 2, 50])
 @pytest.mark.parametrize("with_reference", [False, True])
 def test_a_picture_comes_out_whatever_the_length(tmp_path, count, with_reference):
@@ -104,6 +105,7 @@ def colour_of(picture: np.ndarray, number: int) -> np.ndarray:
     return np.abs(picture.astype(int) - wanted).max(axis=2) < 30
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [2, 3, 5])  # the sixth colour resembles blurred text
 def test_every_panel_fills_its_part_of_the_picture(tmp_path, count):
     """Worlds of very different size and place: each line is long, because its panel has limits of its own."""
@@ -118,6 +120,7 @@ def test_every_panel_fills_its_part_of_the_picture(tmp_path, count):
         assert number % columns < centre < number % columns + 1, "in its column"
 
 
+@pytest.mark.long
 def test_segments_in_one_world_share_a_panel(tmp_path):
     """Two halves of a track: in one panel each covers its half."""
     whole = line(60, (1, 0, 0.3))
@@ -130,6 +133,7 @@ def test_segments_in_one_world_share_a_panel(tmp_path):
     assert left.max() < right.min() + 20 and min(np.ptp(left), np.ptp(right)) > 200
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["$x^{_$", "$x", "a\x1b[31m\x7f", "\udcff.tum", "_run.tum", "a\nb", "50 %"])
 def test_names_are_shown_as_they_are(tmp_path, name):
     """No name of a file is mathematics, a warning about a letter that steers a terminal, or none in the legend."""

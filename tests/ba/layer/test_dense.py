@@ -38,6 +38,7 @@ def clip(data_root: Path) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return *stored_flow(folder), se3.relative(poses_cw[:-1], poses_cw[1:]), k
 
 
+@pytest.mark.long
 def test_motion_from_the_flow_of_every_pixel(clip: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
     """From identity and constant inverse depth: rotation within 0.05 deg and direction within 0.5 deg, each pair."""
     flow, valid, truth, k = clip

@@ -192,6 +192,7 @@ def gradients(p: Any, options: BAOptions, dtype: torch.dtype, seed: int) -> list
     return [torch.zeros_like(x) if g is None else g for x, g in zip(leaves, found, strict=True)]
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.integers(0, 10_000), st.integers(1, 2), st.sampled_from([0, 1, 5, 40, 90]),

@@ -54,6 +54,7 @@ def test_a_gradient_penalty_has_the_gradient_of_the_twin(problem: Maker, changes
         torch.testing.assert_close(a, b, atol=1e-8, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_second_derivatives_against_finite_differences(problem: Maker) -> None:
     p = problem(batch=1, frames=3, per_frame=2, noise=0.3)
     prior = PosePrior(p.true_poses, torch.ones(1, 3, 6, dtype=F64))
@@ -69,6 +70,7 @@ def test_second_derivatives_against_finite_differences(problem: Maker) -> None:
     assert torch.autograd.gradgradcheck(f, leaves, atol=1e-4, rtol=1e-3, fast_mode=True)
 
 
+@pytest.mark.long
 def test_transforms_agree_with_autograd(problem: Maker) -> None:
     p = problem(batch=1, frames=3, per_frame=2, noise=0.3).edges(torch.arange(6))
     loss = loss_of(p)

@@ -88,6 +88,7 @@ def test_a_cluster_of_all_blocks_is_the_inverse():
     torch.testing.assert_close(x, exact)
 
 
+@pytest.mark.long
 def test_a_matrix_too_dense_to_factorise_goes_to_conjugate_gradients(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(block_matrix, "best_plan", lambda *_: None)
     matrix = random_matrix(8, 6, 20, 5)

@@ -13,6 +13,7 @@ from dvo.core.kernels import VARIABLE
 from tests.support.block_systems import PAIRS, system
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(st.integers(1, 31), PAIRS, st.booleans(), st.integers(0, 99))
 def test_the_solution_is_that_of_the_dense_matrix_and_of_the_twin(size, pairs, double, seed):

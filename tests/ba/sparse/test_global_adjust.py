@@ -56,6 +56,7 @@ def least_squares(given: list[Tensor]) -> float:
     return float(scipy_least_squares(residual, start, xtol=1e-13, ftol=1e-13, gtol=1e-13, max_nfev=300).cost)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("solver", ["direct", "cg"])
 @pytest.mark.parametrize("explicit", [True, False])
 def test_the_minimum_is_that_of_scipy(problem: Callable, monkeypatch: pytest.MonkeyPatch, solver: str, explicit: bool):
@@ -175,6 +176,7 @@ def solve_loop(**changes: object) -> tuple[GlobalBAResult, list[float]]:
     return result, [position_error(x, graph.true_poses_cw) for x in (graph.poses_cw, result.poses_cw)]
 
 
+@pytest.mark.long
 def test_two_laps_with_drift_and_wrong_targets_come_back():
     result, (before, after) = solve_loop()
     assert result.converged and after < 0.4 * before

@@ -35,6 +35,7 @@ def everything(bag):
         bag.imu("/imu", 99.9 + 0.02 * index)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["bag", "mcap", "sqlite3"])
 def test_images_calibration_and_inertial_samples(make, kind):
     path = write(make, kind, everything)

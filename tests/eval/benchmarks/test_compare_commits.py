@@ -78,6 +78,7 @@ def test_trees_take_turns_and_the_median_decides():
     assert median_ratios(pairs) == {"track": Cost(1.5, 3.0), "finish": Cost(1.0, 1.5)}
 
 
+@pytest.mark.long
 def test_one_measurement_of_bundle_adjustment():
     (found,) = costs("ba", ROOT, Settings(Path())).items()
     assert found[0] == "ba" and 1e-4 < found[1].processor < 10 and found[1].wall > 1e-4
@@ -113,6 +114,7 @@ def test_training_steps_of_two_trees_take_turns(tmp_path, monkeypatch):
         alternate_steps(tmp_path / "a", tmp_path / "b", 1)
 
 
+@pytest.mark.long
 def test_failures_are_told(tmp_path, capsys):
     with pytest.raises(DvoError, match="failed"):
         costs("tracking", ROOT, Settings(tmp_path, "no such clip"))

@@ -132,6 +132,7 @@ def test_the_calibration_split_has_other_scenes_of_the_same_options(monkeypatch,
     assert main(["--scale", "depth"]) == 0 and "depth" not in calls[-1][0]
 
 
+@pytest.mark.long
 def test_a_sequence_is_measured_on_its_first_frames():
     longer = walk(40)
     short = beginning(longer, 18)

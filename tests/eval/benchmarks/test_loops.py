@@ -60,6 +60,7 @@ OPTIONS = {"kind": "return", "frames": 24, "fps": 2.0, "seed": 3_900_000_009, "f
 SEQUENCE = Sequence("there_and_back", rendered=tuple(sorted(OPTIONS.items())))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dark", [False, True])
 def test_a_run_from_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dark: bool) -> None:
     pytest.importorskip("evo", reason="evo is in the extra 'eval'")

@@ -34,6 +34,7 @@ def test_an_occluded_view_is_not_shared():
     assert shared[0, 1] == pytest.approx(0.5, abs=0.04) and shared[1, 0] == 0
 
 
+@pytest.mark.long
 def test_rendered_depth_agrees_with_the_flow():
     sequence = make_sequence(5, frames=8, fps=2.0, height=96, width=128, family="room")
     depth, intrinsics = depth_maps(sequence, np.array([0, 2, 7]))
@@ -105,6 +106,7 @@ def test_vlad_tells_textures_apart_wherever_they_are():
     assert method.size(entries[0]) == 12
 
 
+@pytest.mark.long
 def test_orb_words_and_their_file(tmp_path):
     images = [
         make_sequence(seed, frames=1, height=120, width=160, family="corridor").frame(0).image for seed in range(3)

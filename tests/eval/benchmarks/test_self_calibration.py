@@ -21,6 +21,7 @@ def test_errors_are_in_deviations_of_what_was_told():
     assert errors(kept, 198.0, 162.0, 110.0) == [] and "cannot tell" in row("a", kept, 198.0, 162.0, 110.0)
 
 
+@pytest.mark.long
 def test_clips_have_cameras_of_their_own():
     cameras = [next(iter(clip(number, 2))).camera for number in (0, 1)]
     assert cameras[0].fx != cameras[1].fx and cameras[0].cx != cameras[1].cx

@@ -16,6 +16,7 @@ from eval.benchmarks.timed_run import CallCounter, Job, Timed, counted, kinds_of
 from tests.support.tiny_tracker import SMALL, frames, tracker
 
 
+@pytest.mark.long
 def test_a_run_in_a_process_of_its_own(tmp_path, image_folder, sequence):
     found = run_once(Job("null", sequence, str(tmp_path), frames=12))
     assert len(found.track_ms) == 12 and min(found.track_ms) > 0 and found.tracked == 1
@@ -80,6 +81,7 @@ def test_calls_of_aten_are_counted_also_without_gradients():
     assert counter.calls == 2
 
 
+@pytest.mark.long
 def test_calls_by_kind_of_frame():
     odometry = tracker(replace(SMALL, keyframe_motion=1e9))  # the first keyframe of three stays
     found = counted(odometry, frames(12))
@@ -100,6 +102,7 @@ def test_kinds_of_lost_repeated_and_aligned_frames():
     assert kinds_of(odometry, [False, False, False, False, True]) == ["keyframe", "", "", "dropped", "aligned"]
 
 
+@pytest.mark.long
 def test_sequences_by_name_and_folder(tmp_path, capsys):
     (suite, sequence), (axis, rendered) = find_sequences(["tum_fr1_rpy_60", "loop_validation_0"])
     assert (suite.name, sequence.name) == ("validation", "tum_fr1_rpy_60")

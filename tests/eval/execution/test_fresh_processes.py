@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 
+import pytest
+
 from eval.execution.fresh_processes import in_fresh_processes
 
 
@@ -11,6 +13,7 @@ def tagged(number: int) -> tuple[int, int]:
     return number, os.getpid()
 
 
+@pytest.mark.long
 def test_all_tasks_are_done_in_order_and_processes_replaced() -> None:
     done = list(in_fresh_processes(tagged, range(5), each=2))
     assert [number for number, _ in done] == list(range(5))

@@ -25,6 +25,7 @@ from eval.execution.predict import (
 )
 
 
+@pytest.mark.long
 def test_a_run_in_its_own_process(job):
     prediction = predict(job)
     assert prediction.status == "ok" and prediction.tracked == len(prediction.stamps) == 20
@@ -44,6 +45,7 @@ def test_time_limit(job):
     assert prediction.status == "timeout" and "0.01 s" in prediction.reason
 
 
+@pytest.mark.long
 def test_death_of_the_process(job, tmp_path):
     prediction = predict(replace(job, system=f"{tmp_path / 'dying.py'}:Dies"))
     assert prediction.status == "unavailable"

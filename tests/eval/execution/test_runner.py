@@ -69,6 +69,7 @@ def table_without_timings(out: Path) -> list[list[str]]:
     return [[value for i, value in enumerate(line) if i not in drop] for line in lines]
 
 
+@pytest.mark.long
 def test_kill_and_resume(tmp_path, image_folder, plan, suite_file, walk, capsys):
     """Killed in the middle of the second run: the first is kept, nothing is done twice, the table is the same."""
     (tmp_path / "whole").mkdir()
@@ -168,6 +169,7 @@ def test_files_that_no_evaluation_has_written_stay(plan, image_folder, name):
     assert caught.value.file == plan.out / name and [file.name for file in plan.out.iterdir()] == [name]
 
 
+@pytest.mark.long
 def test_hang_and_nan_are_rows(tmp_path, image_folder, suite_file, capsys):
     (tmp_path / "nan.py").write_text(SLOW_SYSTEM.replace("PAUSE", "0").replace("np.sin(s + self.seed)", "s * np.nan"))
     (tmp_path / "hang.py").write_text("import time\ndef Hang():\n    time.sleep(600)\n")

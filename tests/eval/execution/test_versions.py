@@ -14,6 +14,7 @@ from eval.suites.suite import ROOT
 from eval.systems.registry import CATALOGUE, find_system
 
 
+@pytest.mark.long
 def test_code_of_a_system_is_what_it_imports(monkeypatch):
     names = {str(file.relative_to(ROOT)) for file in source_files(find_system("klt-pnp"))}
     folder = "dvo/odometry/classical"

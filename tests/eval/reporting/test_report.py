@@ -70,6 +70,7 @@ def page(plan, rows) -> str:
     return write_report(plan.out, manifest, rows).read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_page_is_whole_needs_nothing_else_and_shows_every_system(plan, page, tmp_path, capsys):
     outline = Outline()
     outline.feed(page)

@@ -66,6 +66,7 @@ def cells(line):
     return [cell.strip() for cell in re.split(r"(?<!\\)(?:\\\\)*\|", line)[1:-1]]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", ["system", "sequence", "about", "suite", "label", "reason", "resolution", "machine"])
 def test_names_are_shown_as_they_are(plan, rows, place):
     """Whatever a name holds, it is text: no cell, line, markup, HTML or link."""

@@ -121,6 +121,7 @@ def test_a_rendering_without_samples_is_told(tmp_path: Path) -> None:
         read_stream(tmp_path, {})
 
 
+@pytest.mark.long
 def test_suites_share_no_scene_between_splits_and_last_long_enough() -> None:
     seeds: dict[str, set[int]] = {"validation": set(), "test": set()}
     firsts = {axis.seed for group in ("axes", "memory", "world") for axis in table_of(group).axes.values()}
@@ -158,6 +159,7 @@ def test_suites_hold_what_their_names_say() -> None:
     assert [suite.name for suite in read_suites("inertial")] == ["inertial"]
 
 
+@pytest.mark.long
 def test_frames_carry_the_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DVO_CACHE", str(tmp_path))
     poisoned = next(one for one in read_suites("inertial_poisoned")[0].sequences if "late" in one.name)

@@ -120,6 +120,7 @@ def test_shipped_weights_need_no_prefix():
         find_system("smal")
 
 
+@pytest.mark.long
 def test_a_class_of_another_package_needs_no_registration(job):
     assert find_system("no_such_package.slam:Slam").missing() == (
         "no module no_such_package.slam; install it, or set PYTHONPATH"

@@ -150,6 +150,7 @@ def trained(choice, maps, patches, coords, kk, jj, learn, radius, again=False):
         return [*(c.detach() for c in found), *gradients]
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 1000),

@@ -123,6 +123,7 @@ def test_the_state_stays_bounded_over_many_updates(update):
     assert torch.isfinite(delta).all() and hidden.abs().max() < 100
 
 
+@pytest.mark.long
 def test_gradcheck():
     torch.manual_seed(0)
     config = replace(TINY, hidden_channels=4, patch_size=1, radius=1, pyramid=(1,))

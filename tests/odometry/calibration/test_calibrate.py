@@ -34,6 +34,7 @@ def found(clip):
     return calibrate(clip, guess, options=CalibrationOptions(rounds=1))
 
 
+@pytest.mark.long
 def test_the_focal_length_of_a_rendered_walk_is_found(clip, found):
     camera = clip[0].camera
     assert found.found and found.reason == "" and found.frames > 24
@@ -78,6 +79,7 @@ def test_the_same_seed_and_an_iterator_give_the_same_bytes(clip):
     assert calibrate(iter(clip), options=options) == calibrate(clip, options=options)
 
 
+@pytest.mark.long
 def test_the_file_for_the_next_run(tmp_path, found):
     file = tmp_path / "calib.txt"
     assert found.write(file) and found.write(file)

@@ -37,6 +37,7 @@ def gain(shift, seeds=range(8), **options):
     return shift_gain(pairs, motions)
 
 
+@pytest.mark.long
 def test_a_principal_point_that_stays_needs_no_shift():
     assert gain((0.0, 0.0)) < 0.1
 

@@ -62,6 +62,7 @@ def test_short_blackout_is_lost_and_found(film, path, dark):
     assert metrics.matched == 57 and metrics.ate_percent < 2
 
 
+@pytest.mark.long
 def test_long_blackout_starts_a_second_map(film, path, dark):
     estimates, result = run(dark(film(path(80)), 30, 45))
     assert result.info["maps_started"] == 2

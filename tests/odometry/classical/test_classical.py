@@ -40,6 +40,7 @@ def test_it_is_a_system(name):
     assert isinstance(odometry, Odometry) and odometry.name == name and system.licence == "MIT"
 
 
+@pytest.mark.long
 @every
 def test_same_seed_same_bytes(name, film, path):
     frames = film(path(40))[:11]
@@ -63,6 +64,7 @@ def test_hardly_any_frames(name, film, path, count):
     assert result.trajectory.poses_wc.tolist() == [[0, 0, 0, 0, 0, 0, 1]] * count
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["klt-pnp", "keyframe", "direct"])  # a filter needs more frames a second
 def test_rendered_sequence(name, rendered):
     frames, truth = rendered

@@ -226,6 +226,7 @@ def run(frames: list[Frame], seed: int = 0) -> tuple[list[Estimate], Result]:
     return [odometry.track(frame) for frame in frames], odometry.finish()
 
 
+@pytest.mark.long
 def test_tracks_a_clean_scene(film, path):
     estimates, result = run(film(path()))
     metrics = evaluate(result.trajectory, path())
@@ -237,6 +238,7 @@ def test_tracks_a_clean_scene(film, path):
     assert len(depths) > 200 and (near | far).mean() > 0.8 and near.sum() > 10
 
 
+@pytest.mark.long
 def test_short_blackout_is_lost_and_found(film, path, dark):
     estimates, result = run(dark(film(path(40))[:28], 18, 20))
     assert [(e.status, e.pose_wc) for e in estimates[18:20]] == [(Status.LOST, None)] * 2
@@ -245,6 +247,7 @@ def test_short_blackout_is_lost_and_found(film, path, dark):
     assert evaluate(result.trajectory, path(40)).ate_percent < 3
 
 
+@pytest.mark.long
 def test_long_blackout_starts_anew(film, path, dark):
     moving = path(40)
     estimates, result = run(dark(film(moving), 14, 25))

@@ -171,6 +171,7 @@ def test_verification_finds_motion_and_scale(views: list[Frame]) -> None:
     assert median_depth(world, keyframes[0]) == pytest.approx(5.0, abs=2.5)
 
 
+@pytest.mark.long
 def test_without_loops_nothing_changes(views: list[Frame]) -> None:
     def tracked(**settings: object) -> tuple[np.ndarray, dict]:
         odometry = KeyframeOdometry(corners=300, **settings)

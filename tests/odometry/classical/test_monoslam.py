@@ -21,6 +21,7 @@ def run(frames: list[Frame], config: MonoSlamConfig = SMALL) -> tuple[list[Estim
     return [odometry.track(frame) for frame in frames], odometry.finish()
 
 
+@pytest.mark.long
 def test_tracks_a_clean_scene(film, path):
     estimates, result = run(film(path()))
     metrics = evaluate(result.trajectory, path())
@@ -38,6 +39,7 @@ def test_tracks_a_rendered_room():
     assert metrics.completeness == 1 and metrics.ate_percent < 4
 
 
+@pytest.mark.long
 def test_short_blackout_is_lost_and_found(film, path, dark):
     frames = dark(film(path(40)), 20, 23)
     estimates, result = run(frames)
@@ -46,6 +48,7 @@ def test_short_blackout_is_lost_and_found(film, path, dark):
     assert result.info["maps_started"] == 1 and evaluate(result.trajectory, path(40)).ate_percent < 5
 
 
+@pytest.mark.long
 def test_long_blackout_starts_a_second_map(film, path, dark):
     frames = dark(film(path(45)), 10, 30)
     estimates, result = run(frames)
@@ -61,6 +64,7 @@ def test_pure_rotation_turns_and_hardly_moves(film, path):
     assert np.linalg.norm(result.trajectory.positions, axis=1).max() < 0.3  # of the distance that points begin at
 
 
+@pytest.mark.long
 def test_units_come_from_the_stamps(film, path):
     """The same pictures at half the rate are a motion half as fast: the path is the same."""
     fast = path(30)

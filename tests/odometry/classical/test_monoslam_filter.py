@@ -191,6 +191,7 @@ def simulate(seed: int, steps: int = 24) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.long
 def test_consistent_where_depths_are_known_roughly():
     """The normalised error squared of an honest filter has mean 6; errors of neighbouring steps are one error.
 

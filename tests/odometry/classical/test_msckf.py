@@ -48,6 +48,7 @@ def difference(one, two):
 # --- propagation ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_samples_without_noise_lead_along_the_path():
     body, times = Hand(3, 0.0, T=T_CAMERA_IMU), 1 + np.arange(401) / RATE
     imu = measure_imu(body, times)
@@ -143,6 +144,7 @@ def observe(clones, R_bc, p_bc, points, point, clone, delays):
     return Views(point, clone, local[:, :2] / local[:, 2:], delays)
 
 
+@pytest.mark.long
 @settings(max_examples=10, deadline=None)
 @given(seeds)
 def test_points_are_found(seed):
@@ -152,6 +154,7 @@ def test_points_are_found(seed):
     assert good.all() and np.allclose(found, points, atol=1e-4)
 
 
+@pytest.mark.long
 @settings(max_examples=10, deadline=None)
 @given(seeds)
 def test_residuals_without_points_are_linear_in_the_error(seed):
@@ -226,6 +229,7 @@ def simulate(scene, **options):
     return estimator, np.array(nees[20:]).mean(0), metrics
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("most", "options"),
     [
@@ -251,6 +255,7 @@ def test_standing_still_it_stays():
     assert len(f.clones) < 4 and np.sqrt(f.P[9:12, 9:12].diagonal()).max() < 3e-4
 
 
+@pytest.mark.long
 def test_constant_velocity_starts_nothing():
     estimator, _, _ = simulate(world(4, 2.8, motion=Straight()))
     assert estimator.filter is None and estimator.reason == "too little motion"
@@ -299,6 +304,7 @@ def filmed(film, seconds, rest, seed=5):
     )], truth  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_film_in_metres_with_z_up(film, dark):
     frames, truth = filmed(film, 5.5, rest=1.3)
     odometry = dvo.load("msckf", corners=120)

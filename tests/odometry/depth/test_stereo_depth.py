@@ -128,6 +128,7 @@ def tracked(images, **settings):
     return odometry.finish()
 
 
+@pytest.mark.long
 def test_a_walk_with_right_images_is_in_metres_and_repeats_its_bytes():
     first, again = (tracked(stereo_wall(14), scale={"stereo": True}) for _ in range(2))
     assert first.metric and first.info["scale"]["source"] == "stereo"

@@ -124,6 +124,7 @@ def tracked(clip):
         return run(DroidOdometry(Knowing(clip), CONFIG), frames_of(clip))
 
 
+@pytest.mark.long
 def test_true_flow_gives_the_true_trajectory_and_depth(clip, tracked):
     done = tracked.result
     assert done.frames_lost == 0 and len(done.trajectory) == len(clip.images) and len(done.segments) == 1
@@ -168,6 +169,7 @@ def test_a_moving_body_does_not_pull_the_camera(clip, monkeypatch):
     assert errors[0] < 0.5 * errors[1] and errors[1] > 2
 
 
+@pytest.mark.long
 def test_more_updates_than_an_edge_lives_for(clip, knowing):
     settings = replace(CONFIG, initial_updates=6, updates=8, max_age=4)
     done = run(DroidOdometry(knowing, settings), frames_of(clip)[:14]).result
@@ -176,6 +178,7 @@ def test_more_updates_than_an_edge_lives_for(clip, knowing):
     assert evaluate(done.trajectory, Trajectory(done.trajectory.timestamps, truth)).ate_percent < 2
 
 
+@pytest.mark.long
 def test_another_scene_is_lost_and_then_begins_a_segment(clip, knowing):
     odometry = DroidOdometry(knowing, replace(CONFIG, patience=3))
     first = frames_of(clip)[:14]
@@ -189,6 +192,7 @@ def test_another_scene_is_lost_and_then_begins_a_segment(clip, knowing):
     assert odometry.finish().segments[0].trajectory.timestamps[-1] == first[-1].timestamp
 
 
+@pytest.mark.long
 def test_black_images_are_lost_and_bridged(clip, knowing):
     odometry = DroidOdometry(knowing, CONFIG)
     frames = frames_of(clip)[:18]
@@ -202,6 +206,7 @@ def test_black_images_are_lost_and_bridged(clip, knowing):
     assert (gap.frames, gap.reason, gap.new_segment) == (1, "black image", False)
 
 
+@pytest.mark.long
 def test_a_random_network_tracks_a_clip(model, clip):
     """The images support no pose here: every stage of the odometry is run, and memory stays bounded."""
     odometry = build_odometry(LoadedWeights.of(model, "dense"), config=replace(EVERY, restart=True))
@@ -236,6 +241,7 @@ def test_frames_without_motion_stay_at_their_keyframe(model, clip):
     assert np.array_equal(result.trajectory.poses_wc, np.tile([0.0, 0, 0, 0, 0, 0, 1], (5, 1)))
 
 
+@pytest.mark.long
 def test_few_keyframes_are_initialised_at_the_end(clip, knowing):
     result = run(DroidOdometry(knowing, replace(CONFIG, warm_up=8)), frames_of(clip)[:9]).result
     assert len(result.trajectory) == 9 and 2 <= len(result.depth) < 8
@@ -264,6 +270,7 @@ def test_finish_after_any_number_of_frames(model, clip):
         one.track(second)
 
 
+@pytest.mark.long
 def test_the_cloud_is_written_as_the_map(tracked, tmp_path):
     write_results(tmp_path, tracked, {})
     header = (tmp_path / "map.ply").read_bytes().split(b"end_header")[0].decode()

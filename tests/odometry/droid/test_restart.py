@@ -94,6 +94,7 @@ def wrong_window(truth):
     return window
 
 
+@pytest.mark.long
 def test_the_wrong_motion_of_a_plane_is_left(truth):
     window = wrong_window(truth)
     assert turns(window, truth[0]).min() > 1  # it is another solution
@@ -113,6 +114,7 @@ def test_the_wrong_motion_of_a_plane_is_left(truth):
     assert turns(window, truth[0]).max() < 0.2
 
 
+@pytest.mark.long
 def test_the_right_solution_stays_as_it_was(truth):
     """Also its held edges, whatever edges the updates of the other one hold."""
     window = window_at(*truth)
@@ -139,6 +141,7 @@ def test_the_right_solution_stays_as_it_was(truth):
         assert all(a is b for a, b in zip((edge.positions, edge.confidence, edge.hidden, edge.age), kept, strict=True))
 
 
+@pytest.mark.long
 def test_a_solution_that_is_much_worse_is_not_measured(truth):
     window = window_at(*truth)
     measure(window, *truth)

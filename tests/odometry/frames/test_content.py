@@ -52,6 +52,7 @@ def test_strong_noise_is_left_to_the_measurements():
     assert missing_content(np.random.default_rng(0).integers(0, 256, SHAPE, np.uint8)) == ""
 
 
+@pytest.mark.long
 def test_views_match_and_noise_and_other_scenes_do_not(view):
     from dvo.odometry.two_frame.deepvo import RegressionConfig
 

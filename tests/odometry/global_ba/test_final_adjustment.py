@@ -18,6 +18,7 @@ from dvo.synth.sequence import make_sequence
 from tests.support.archived_walk import archived_walk
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("block", [600, 15])
 @pytest.mark.parametrize("wrong", [0.0, 0.15])
 def test_poses_and_scale_are_found_from_the_measurements(wrong, block):

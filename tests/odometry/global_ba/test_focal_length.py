@@ -25,6 +25,7 @@ def walk_with(factor, noise=0.1, **options):
     return graph
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("factor", [0.6, 0.9, 1.0, 1.5])
 def test_the_focal_length_is_found_from_the_measurements(factor):
     graph = walk_with(factor, wrong=0.1)

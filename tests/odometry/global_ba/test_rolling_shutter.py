@@ -80,6 +80,7 @@ def test_the_trajectory_of_a_rolling_shutter_is_exact_with_its_readout_time():
     assert errors[1] < 0.6 * errors[0] and errors[2] < 0.01 * errors[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", [0.0, 0.1])
 @pytest.mark.parametrize("readout", [0.0, 0.025, 0.06])
 def test_the_readout_time_is_found_from_the_measurements(readout, wrong):
@@ -121,6 +122,7 @@ def test_a_minimum_at_the_end_of_the_range_has_no_deviation():
     assert found.value == 1.0 and found.deviation == np.inf and found.gain == pytest.approx(0.5)
 
 
+@pytest.mark.long
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 1000), st.floats(-0.08, 0.08), st.booleans(), st.floats(0, 3))
 def test_measurements_are_corrected_by_a_kernel_as_by_its_twin(seed, readout, empty, turn):

@@ -37,6 +37,7 @@ def test_hand_held_motion_is_aligned_within_six_seconds() -> None:
     assert estimator.worlds[0].scale == pytest.approx(SCALE, rel=0.03)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "word"),
     [
@@ -53,6 +54,7 @@ def test_motion_that_does_not_tell_is_refused_with_the_reason(options: dict[str,
     assert any(word in reason for reason in reasons)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("grade", ["euroc", "phone"])
 @pytest.mark.parametrize(
     "options",
@@ -73,6 +75,7 @@ def test_no_alignment_is_wrong_during_and_after_such_motion(options: dict[str, o
     assert estimator.aligned
 
 
+@pytest.mark.long
 def test_alignment_follows_a_stretch_that_does_not_tell() -> None:
     estimator, _ = drive(record(2, still=5.0, turning=False, seconds=11.0))
     assert estimator.aligned
@@ -162,6 +165,7 @@ def _consistency(recording: Recording, window: float) -> np.ndarray:
     return np.array(rows)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("grade", ["euroc", "phone"])
 def test_poses_err_as_much_as_their_covariance_says(grade: str) -> None:
     """Also when the window has left the alignment behind, with images whose heading and unit drift."""
@@ -173,6 +177,7 @@ def test_poses_err_as_much_as_their_covariance_says(grade: str) -> None:
     assert (np.mean([rows.mean(0) for rows in found], 0) < 2.0).all()
 
 
+@pytest.mark.long
 def test_prediction_in_the_dark_is_within_its_covariance() -> None:
     squares = []
     for seed in range(3):
@@ -249,6 +254,7 @@ def test_the_gyroscope_tells_rotations_about_the_times_of_frames_without_an_alig
     assert estimator.turns(recording.nodes(0.1, 7.5)) is None
 
 
+@pytest.mark.long
 def test_drift_of_the_scale_of_the_images_is_taken_back() -> None:
     recording = record(7, seconds=14.0, drift=0.03)
     estimator, _ = drive(recording)

@@ -45,6 +45,7 @@ def test_good_samples_have_no_findings() -> None:
     assert abs(report.values["clock drift, ppm"]) < 200
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_seen", [True, False])
 def test_wrong_units(is_seen: bool) -> None:
     imu, times, rotations = good()
@@ -89,6 +90,7 @@ def test_axes_of_one_sensor_alone() -> None:
     assert finding is not None and "(z, x, y)" in finding.remedy and names(report) == {"accelerometer axes"}
 
 
+@pytest.mark.long
 def test_extrinsics_inverse_off_and_missing() -> None:
     T = good()[0].T_camera_imu
     assert T is not None
@@ -102,6 +104,7 @@ def test_extrinsics_inverse_off_and_missing() -> None:
     assert finding is not None and "T_camera_imu: [" in finding.remedy and missing.is_usable
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("offset", [0.1, -0.1, 0.02, 1.3])
 def test_constant_time_offset(offset: float) -> None:
     report = checked(timestamps=good()[0].timestamps + offset)
@@ -112,6 +115,7 @@ def test_constant_time_offset(offset: float) -> None:
     assert report.is_usable == (abs(offset) < 0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("drift", [5e-4, -3e-3, 1e-2])
 def test_clock_that_drifts(drift: float) -> None:
     report = checked(timestamps=good()[0].timestamps * (1 + drift))

@@ -43,6 +43,7 @@ def test_newest_state_is_within_its_covariance() -> None:
     assert 0.2 < np.mean(squares) / 3 < 5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("grade", ["euroc", "phone"])
 def test_noise_of_the_images_is_found_beside_that_of_the_sensor(grade: str) -> None:
     found = {}

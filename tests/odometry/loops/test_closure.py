@@ -338,6 +338,7 @@ def test_a_scene_never_seen_before_is_no_loop(film):
     assert not any(loop["from"] > 2.0 > loop["to"] for loop in result.info["loops"])
 
 
+@pytest.mark.long
 def test_a_wrong_loop_is_not_confirmed(film, monkeypatch):
     """A single false match, by whatever likeness, does not change the map."""
     odometry = dvo.load("small", device="cpu", loop=OPTIONS, **SHORT)

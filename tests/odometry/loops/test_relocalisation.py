@@ -105,6 +105,7 @@ def test_other_scenes_are_found_back_as_well(scene):
     assert [segment.joined_to for segment in result.segments] == [None, 0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scene", "other", "lit", "dark", "after"),
     [(63, 105, 22, 6, range(14)), pytest.param(63, 105, LIT, DARK, range(30), marks=pytest.mark.slow),

@@ -59,6 +59,7 @@ def dark(images: list[Frame], first: int, last: int) -> list[Frame]:
     ]
 
 
+@pytest.mark.long
 def test_until_it_is_aligned_the_output_equals_that_without_samples() -> None:
     (alone, first), aided = plain(14), tracker()
     for a, other in zip(alone, with_samples(frames(14)), strict=True):
@@ -91,6 +92,7 @@ def test_another_source_of_metres_is_left_alone() -> None:
     assert result.info["scale"]["source"] == "distance"
 
 
+@pytest.mark.long
 def test_poses_turn_upright_and_metric_and_so_does_the_result() -> None:
     (alone, before), aided = plain(14), tracker()
     aided.patch_window.sensors = ()  # in which the samples would change the visual poses as well
@@ -135,6 +137,7 @@ def test_frames_without_a_view_are_predicted_and_never_counted_as_tracked() -> N
     assert set(result.inertial) == {frame.timestamp for frame in images[12:]}
 
 
+@pytest.mark.long
 def test_frames_after_a_dropped_keyframe_are_bridged_too() -> None:
     """With a threshold that no motion passes, the keyframe before the dark is dropped later."""
     odometry = tracker(replace(SMALL, keyframe_motion=1e9))
@@ -146,6 +149,7 @@ def test_frames_after_a_dropped_keyframe_are_bridged_too() -> None:
     assert len(result.inertial) == 2 and len(result.trajectory) == 24
 
 
+@pytest.mark.long
 def test_a_world_that_is_not_there_any_more_moves_nothing() -> None:
     once, twice = tracker(), tracker()
     for odometry in (once, twice):
@@ -201,6 +205,7 @@ def test_what_is_missing_at_the_end_is_spread_over_the_time() -> None:
     np.testing.assert_allclose(2 * np.arcsin(led[:, 5]), [0.1, 0.2, 0.3])
 
 
+@pytest.mark.long
 def test_the_window_measures_samples_from_the_alignment_on_until_it_is_withdrawn() -> None:
     odometry, measured = tracker(), []
     for k, frame in enumerate(with_samples(frames(18))):

@@ -54,6 +54,7 @@ def back(walk, old):
     return odometry, estimates, repeated
 
 
+@pytest.mark.long
 def test_it_is_localised_in_the_world_and_the_scale_of_the_map(walk, old, back):
     odometry, estimates, *_ = back
     result, frames = odometry.finish(), way_back(walk[0])
@@ -70,6 +71,7 @@ def test_it_is_localised_in_the_world_and_the_scale_of_the_map(walk, old, back):
     assert error_of_both(old[1].trajectory, result.trajectory, walk[1]) < 1.0
 
 
+@pytest.mark.long
 def test_the_first_pose_in_the_map_is_told(walk, old, back):
     _, estimates, (now, repeated) = back
     assert {estimate.segment for estimate in estimates} == {0}
@@ -82,6 +84,7 @@ def test_the_first_pose_in_the_map_is_told(walk, old, back):
     assert np.array_equal(repeated.pose_wc, estimates[first].pose_wc) and not repeated.recovered
 
 
+@pytest.mark.long
 def test_the_map_stays_as_it_was(old, back, tmp_path):
     odometry = back[0]
     before = dvo.load_map(old[0])
@@ -115,6 +118,7 @@ def elsewhere(old, tmp_path_factory):
     return odometry.finish(), file
 
 
+@pytest.mark.long
 def test_a_recording_that_was_not_recognised_is_saved_with_its_map(old, elsewhere):
     found = dvo.load_map(elsewhere[1])
     assert len(found.graph.recordings) == 2 and found.loops.finder.kept[-1] >= found.graph.recording.keyframe
@@ -124,6 +128,7 @@ def test_a_recording_that_was_not_recognised_is_saved_with_its_map(old, elsewher
     assert np.array_equal(found.graph.log.trajectory(0).poses_wc, old[1].trajectory.poses_wc)
 
 
+@pytest.mark.long
 def test_another_place_is_not_recognised(elsewhere):
     result = elsewhere[0]
     assert result.info["localised"] is None and result.info["loops"] == []

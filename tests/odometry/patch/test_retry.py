@@ -70,6 +70,7 @@ def lost_frames(frames, result):
     return np.flatnonzero(~np.isin([frame.timestamp for frame in frames], rows)).tolist()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("weights", "settings"),
     [("small", {}), pytest.param("mamba", {}, marks=pytest.mark.slow), ("small", {"preset": "fast"})],
@@ -99,6 +100,7 @@ def test_the_frame_after_the_dark_gets_a_pose_with_the_next_one(film, dark, monk
     assert {*edges.target[edges.source == own]} & {*edges.source[edges.target == own]}
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_newest_views_are_tried_again_up_to_one_that_fails(dark, foreign, monkeypatch):
     refuse(monkeypatch, *(frame.timestamp for frame in dark[BACK : BACK + 3]))
@@ -107,6 +109,7 @@ def test_the_newest_views_are_tried_again_up_to_one_that_fails(dark, foreign, mo
     assert lost_frames(other, track(other, join_inliers=0.2)[1]) == list(range(CUT, BACK + 2))
 
 
+@pytest.mark.long
 def test_a_view_that_is_not_supported_changes_nothing(dark, foreign, monkeypatch, tmp_path):
     """Results and files are those of a tracker that does not try again, byte for byte."""
     frames = with_images(dark, [foreign], BACK)
@@ -126,6 +129,7 @@ def test_a_view_that_is_not_supported_changes_nothing(dark, foreign, monkeypatch
     assert (tmp_path / "tried.dvo").read_bytes() == (tmp_path / "not.dvo").read_bytes()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_pose_that_would_cost_the_newest_frame_its_own_is_refused(dark, monkeypatch):
     refuse(monkeypatch, dark[BACK].timestamp)
@@ -142,6 +146,7 @@ def test_a_pose_that_would_cost_the_newest_frame_its_own_is_refused(dark, monkey
     assert BACK in lost_frames(dark, track(dark)[1])
 
 
+@pytest.mark.long
 def test_later_frames_do_not_count(dark):
     """What counts for a frame is what counted when it was the newest."""
     odometry = dvo.load("small", device="cpu", **FAST)
@@ -159,6 +164,7 @@ def test_later_frames_do_not_count(dark):
         window.confidence = kept
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_repetition_of_a_view_that_was_joined_late_shares_its_pose(dark, monkeypatch):
     frames = with_images(dark, [dark[BACK].image], BACK + 1)
@@ -170,6 +176,7 @@ def test_a_repetition_of_a_view_that_was_joined_late_shares_its_pose(dark, monke
     assert poses[frames[BACK].timestamp] == poses[frames[BACK + 1].timestamp]
 
 
+@pytest.mark.long
 def test_a_gap_in_time_is_told_before_the_frame_that_was_joined_late(film, monkeypatch):
     clear = list(film)
     later = [replace(frame, timestamp=frame.timestamp + 5.0) for frame in clear[CUT + 3 :]]

@@ -19,6 +19,7 @@ from dvo.synth.sequence import make_sequence
 from tests.support.tiny_tracker import SMALL, frames, plain, run, tracker
 
 
+@pytest.mark.long
 def test_sigma_changes_no_trajectory():
     """It is for covariances alone."""
     poses = [run(tracker(replace(SMALL, sigma=sigma)), frames(10))[1].trajectory.poses_wc for sigma in (0.06, 1.0)]
@@ -42,6 +43,7 @@ def test_is_an_odometry_with_a_pose_for_every_frame():
     assert len(result.map.points) > 0
 
 
+@pytest.mark.long
 def test_same_seed_same_bytes_and_another_seed_another_trajectory():
     first, second, other = (run(tracker(seed=s), frames(9))[1].trajectory.poses_wc for s in (3, 3, 4))
     assert first.tobytes() == second.tobytes()
@@ -68,6 +70,7 @@ def test_dropped_keyframes_keep_their_frames():
     assert result.info["keyframes"] < 12
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("setting", ["initial_motion", "initial_parallax"])
 def test_a_sequence_that_is_not_initialised_has_no_rows(setting):
     """Neither without motion nor without parallax: a pose of every frame would be an invention, points too."""

@@ -165,6 +165,7 @@ def test_images_of_noise_are_lost(weights, frames, start):
     assert [e.segment for e in estimates[start + 5 :]] == [int(start > 0)] * (9 - start)
 
 
+@pytest.mark.long
 def test_another_scene_begins_a_segment(weights, frames):
     foreign = [f.image for f in make_sequence(23, frames=5, height=96, width=128, fps=10.0, sensor=False)]
     estimates, result = track(weights, strange(frames, foreign, 4))

@@ -142,6 +142,7 @@ def test_depths_that_are_not_measured_change_no_byte(tracked):
     assert found.covariance.tobytes() == plain.covariance.tobytes() and found.confidence == plain.confidence
 
 
+@pytest.mark.long
 def test_it_is_computed_when_it_is_read_with_the_same_bytes(tracked, monkeypatch):
     """After tracking went on, and whether or not others were read; nothing is computed for what nobody reads."""
     known = [e for e in tracked[2] if e.covariance is not None]  # read, whether or not another test did
@@ -206,6 +207,7 @@ def test_the_gauge_leaves_out_frames_without_measurements(tracked):
     assert window_gauge(window.problem()) is None and newest_uncertainty(step, TrackerConfig().variance) is UNKNOWN
 
 
+@pytest.mark.long
 def test_no_pose_depends_on_it(tracked, monkeypatch):
     monkeypatch.setattr(tracker_module, "LaterUncertainty", lambda step, config, ambiguous: UNKNOWN)
     odometry = dvo.load("small", **FAST)

@@ -85,6 +85,7 @@ def aligned(odometry) -> list:
     ]
 
 
+@pytest.mark.long
 def test_a_slow_camera_is_aligned(walk):
     odometry, estimates, result, frames, truth, _ = walk
     assert len(aligned(odometry)) > len(frames) // 3
@@ -95,6 +96,7 @@ def test_a_slow_camera_is_aligned(walk):
     assert all(np.linalg.eigvalsh(estimate.covariance).min() > 0 for estimate in tracked)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_it_is_as_exact_as_with_the_network_at_every_frame(walk):
     _, _, result, frames, truth, _ = walk
@@ -106,6 +108,7 @@ def test_it_is_as_exact_as_with_the_network_at_every_frame(walk):
     assert evaluate(result.trajectory, truth).ate_percent < 2 * least + 0.2
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_again_the_same_bytes(walk):
     odometry, _, result, frames, *_ = walk
@@ -114,6 +117,7 @@ def test_again_the_same_bytes(walk):
     assert odometry.finish().trajectory.poses_wc.tobytes() == result.trajectory.poses_wc.tobytes()
 
 
+@pytest.mark.long
 def test_a_fast_camera_is_measured_by_the_network():
     frames, _ = film(14, speed=8.0, fps=8.0, height=120, width=160)
     odometry = dvo.load("small", **FEW)
@@ -124,6 +128,7 @@ def test_a_fast_camera_is_measured_by_the_network():
     assert len(aligned(odometry)) <= 2
 
 
+@pytest.mark.long
 def test_bare_surfaces_are_measured_by_the_network():
     """Edges alone tell no motion along themselves, however well the windows correlate."""
     frames, _ = film(24, texture=0.02)
@@ -135,6 +140,7 @@ def test_bare_surfaces_are_measured_by_the_network():
     assert len(aligned(odometry)) <= len(frames) // 4
 
 
+@pytest.mark.long
 def test_another_picture_is_not_aligned(walk):
     """A frame without a match is lost, as it is without the alignment."""
     others = walk[-1]
@@ -143,6 +149,7 @@ def test_another_picture_is_not_aligned(walk):
     assert others.counts[0] == others.counts[1] > 0
 
 
+@pytest.mark.long
 def test_their_measurements_take_part_in_the_final_adjustment(walk):
     """Moved away, the frames return, and keyframes stay where they were."""
     odometry, _, result, *_ = walk
@@ -157,6 +164,7 @@ def test_their_measurements_take_part_in_the_final_adjustment(walk):
     assert away.mean() < noise.abs().mean() / 5
 
 
+@pytest.mark.long
 def test_saved_and_read_again(walk, tmp_path):
     odometry, _, result, *_ = walk
     odometry.save(tmp_path / "map.dvo")

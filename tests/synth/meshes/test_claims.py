@@ -234,6 +234,7 @@ BROKEN = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", BROKEN)
 def test_broken_obj(tmp_path: Path, case: str) -> None:
     (tmp_path / "m.mtl").write_text("newmtl m\nmap_Kd t.png\n")

@@ -62,6 +62,7 @@ def test_vertex_colours_of_a_ply(tmp_path: Path) -> None:
     assert np.allclose(frames.images[0].numpy()[:, hit], expected, atol=1e-5)
 
 
+@pytest.mark.long
 def test_untextured_mesh_is_painted_and_says_so(tmp_path: Path) -> None:
     trimesh.creation.icosphere(subdivisions=2).export(tmp_path / "ball.ply")
     scene = load_mesh(tmp_path / "ball.ply")

@@ -29,6 +29,7 @@ def test_triangle_distance(seed: int) -> None:
     assert exact <= sampled + 1e-9 and exact > sampled - 0.12
 
 
+@pytest.mark.long
 def test_objects_are_seen_from_outside_and_rooms_from_within() -> None:
     ball = mesh_scene(trimesh.creation.icosphere(subdivisions=3), ground=False)
     assert not ball.space.inside

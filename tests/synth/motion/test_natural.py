@@ -67,6 +67,7 @@ def test_a_process_has_its_band_and_slope(band: tuple[float, float], slope: floa
     assert fitted == pytest.approx(-slope, abs=0.35)
 
 
+@pytest.mark.long
 def test_acceleration_of_a_hand_is_no_sum_of_a_few_sines(motions, scene: Scene) -> None:
     path, imu = motions["hand"]
     found = acceleration(path, imu)
@@ -78,6 +79,7 @@ def test_acceleration_of_a_hand_is_no_sum_of_a_few_sines(motions, scene: Scene) 
     assert lines(found) > 60 > 3 * lines(acceleration(sines, measure_imu(sines, TIMES)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", NATURAL_KINDS)
 def test_motions_are_as_fast_as_people_and_drones_and_touch_nothing(motions, scene: Scene, kind: str) -> None:
     path, imu = motions[kind]
@@ -94,6 +96,7 @@ def test_motions_are_as_fast_as_people_and_drones_and_touch_nothing(motions, sce
         assert 40 < np.quantile(turning, 0.98) < 200
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["hand", "quadrotor"])
 def test_accelerations_are_continuous_and_those_of_the_path(motions, kind: str) -> None:
     path, imu = motions[kind]
@@ -107,6 +110,7 @@ def test_accelerations_are_continuous_and_those_of_the_path(motions, kind: str) 
     np.testing.assert_allclose(acceleration(path, measured)[1:-1], differentiated, atol=0.02)
 
 
+@pytest.mark.long
 def test_a_motion_goes_on_beyond_its_frames(motions) -> None:
     path, _ = motions["hand"]
     edges = np.array([-LEAD, -LEAD + 0.01, SECONDS + LEAD - 0.01, SECONDS + LEAD - 0.001])
@@ -114,6 +118,7 @@ def test_a_motion_goes_on_beyond_its_frames(motions) -> None:
     assert not np.array_equal(first, second) and not np.array_equal(third, fourth)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", DEGENERATE)
 def test_stretches_tell_less_than_what_follows(motions, kind: str) -> None:
     path, imu = motions[kind]
@@ -139,6 +144,7 @@ def test_stretches_tell_less_than_what_follows(motions, kind: str) -> None:
             assert speeds.min() > 0.1 if kind == "constant" else speeds.max() < 1e-9
 
 
+@pytest.mark.long
 def test_a_quadrotor_tilts_by_its_acceleration(motions) -> None:
     path, imu = motions["quadrotor"]
     world = acceleration(path, imu)
@@ -151,6 +157,7 @@ def test_a_quadrotor_tilts_by_its_acceleration(motions) -> None:
     assert np.corrcoef(needed, rolled)[0, 1] > 0.7
 
 
+@pytest.mark.long
 def test_a_motion_is_drawn_from_its_seed(scene: Scene) -> None:
     times = np.linspace(0, 3, 7)
     one, again, other = (natural_path(scene, seed, "hand", 3.0).poses_wc(times) for seed in (5, 5, 6))

@@ -21,6 +21,7 @@ def scenes() -> dict[str, Scene]:
     return {family: random_scene(2, family, pool=texture_pool(11, count=24, size=64)) for family in SHARES}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_paths_are_smooth_and_start_in_free_space(scenes: dict[str, Scene], kind: str) -> None:
     for family, scene in scenes.items():

@@ -27,6 +27,7 @@ def scene() -> Scene:
     return random_scene(2, "room", pool=texture_pool(11, count=24, size=64))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_long_paths_stay_in_free_space(scenes: dict[str, Scene], kind: str) -> None:
     for family in ("room", "corridor", "street"):
@@ -37,6 +38,7 @@ def test_long_paths_stay_in_free_space(scenes: dict[str, Scene], kind: str) -> N
         assert np.linalg.norm(np.diff(positions, axis=0), axis=1).max() < 0.2 * scene.scale
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [kind for kind in LONG_KINDS if kind in ("loop", "straight", "fast")])
 @pytest.mark.parametrize("family", ["room", "street", "clutter"])
 def test_long_kinds_do_what_they_say(kind: str, family: str) -> None:
@@ -61,6 +63,7 @@ def test_long_kinds_do_what_they_say(kind: str, family: str) -> None:
         assert turns[0] > 1.5 * turns[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["orbit", "rotation", "drone", "stop_and_go"])
 def test_kinds_of_paths_in_held_out_families(kind: str) -> None:
     for family in HELD_OUT:

@@ -48,6 +48,7 @@ def test_every_drawn_lens_has_a_ray_for_every_pixel(seed, model, size):
     assert camera.is_distorted
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lens", LENSES)
 def test_depth_and_surfaces_are_those_of_the_bent_rays(lens):
     """Each pixel against a ray of its own, cast by a pinhole camera."""
@@ -62,6 +63,7 @@ def test_depth_and_surfaces_are_those_of_the_bent_rays(lens):
     np.testing.assert_allclose(got.uv[0].numpy()[y.ravel(), x.ravel()][same], uv[0][same], atol=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lens", LENSES)
 def test_undistorted_it_is_the_picture_without_a_lens(lens):
     """OpenCV's maps, which know nothing of the renderer, take the picture back to a pinhole's."""
@@ -110,6 +112,7 @@ def test_behind_the_lens_range_nothing_is_in_the_picture():
     assert not shot.inside(distorted_pixels(folded, camera), np.array([1.0])).any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", ["radtan", "fisheye"])
 def test_a_sequence_through_a_lens_is_read_back(model, tmp_path):
     sequence = make_sequence(3, frames=3, height=96, width=128, fps=10, family="room", lens=model)

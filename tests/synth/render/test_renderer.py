@@ -69,6 +69,7 @@ def test_pixel_lands_on_same_surface_and_texture_coordinate(pool: TexturePool, f
         assert error.max() < 1e-3
 
 
+@pytest.mark.long
 def test_warp_is_photometrically_consistent() -> None:
     """Frame i warped to j by depth and pose equals frame j outside occlusions, in every family."""
     pool = texture_pool(5)

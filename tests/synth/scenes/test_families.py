@@ -23,6 +23,7 @@ H, W = 48, 64
 K = np.array([50.0, 50.0, 31.5, 23.5])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", list(FAMILIES))
 def test_every_family_renders_the_same_twice_and_lets_cameras_pass(family: str) -> None:
     pool = texture_pool(11, count=24, size=64)

@@ -26,6 +26,7 @@ def scene() -> Scene:
     return random_scene(4, "room", pool=texture_pool(5))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["handheld", "rotation", "fast", "loop"])
 def test_exact_imu_integrates_back_to_the_path(scene: Scene, kind: str) -> None:
     path = long_path(scene, 5, kind, 3.0)

@@ -32,6 +32,7 @@ def test_any_size(height, width):
     assert np.abs(compressed_video(grey, 20).astype(int) - 90).max() <= 3
 
 
+@pytest.mark.long
 def test_a_sequence_is_read_in_any_order():
     sequence = make_sequence(3, frames=LENGTH + 3, h264=34, **SIZE)
     last = sequence.frame(LENGTH + 1).image

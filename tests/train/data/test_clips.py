@@ -7,6 +7,7 @@ from dvo.core.errors import DvoError
 from train.data.clips import CurriculumStage, MixedClips, Renderings
 
 
+@pytest.mark.long
 def test_a_stage_begins_at_its_clip():
     stages = [CurriculumStage(0, 1.0, 4.0, [(48, 64)]), CurriculumStage(4, 1.0, 4.0, [(64, 48), (32, 48)])]
     clips = MixedClips(5, stages, 2, frames=2)
@@ -22,6 +23,7 @@ def test_stages_keep_their_former_name():
         Renderings(stages=later, courses=later)
 
 
+@pytest.mark.long
 def test_moving_bodies_and_low_light_are_in_the_clips_of_all_stages():
     options = {"seed": 5, "frames": 2, "sizes": [(48, 64)], "flow_low": 1.0, "flow_high": 4.0}
     later = [CurriculumStage(4, 1.0, 4.0, [(32, 48)])]

@@ -101,6 +101,7 @@ def test_bad_settings_are_named(settings, message):
         Mixture(**settings)
 
 
+@pytest.mark.long
 def test_a_batch_is_of_one_kind(moving):
     mixture = Mixture(
         seed=2, batch_size=2, frames=3, sizes=[SIZE], real=data(moving, share=0.5), workers=0,

@@ -6,6 +6,7 @@ import torch
 from train.engine.baseline import LossBeforeTraining
 
 
+@pytest.mark.long
 def test_the_loss_is_that_of_the_first_step(tmp_path, runs, capsys):
     for name in ("plain", "told"):
         (tmp_path / name).mkdir()

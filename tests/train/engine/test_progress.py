@@ -2,9 +2,12 @@
 
 import sys
 
+import pytest
+
 from train.engine.progress import StepBar
 
 
+@pytest.mark.long
 def test_lines_count_from_the_state(tmp_path, runs, capsys):
     runs.fit(tmp_path, 1)
     capsys.readouterr()

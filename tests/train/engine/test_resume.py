@@ -14,6 +14,7 @@ def same(a, b):
         assert torch.equal(x, y), name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("loss", [pytest.param(None, id="plain", marks=pytest.mark.slow), pytest.param(V2V, id="v2v")])
 def test_resumed_training_equals_uninterrupted_training(tmp_path, runs, loss):
     for name in "abc":

@@ -121,6 +121,7 @@ def test_weights_are_the_start_of_network_and_average(runs, tmp_path):
     assert isinstance(weights, LoadedWeights) and program.provenance.start["name"] == "tiny"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("resumed", [True, False])
 def test_a_new_run_from_a_state_has_rates_of_its_own(runs, tmp_path, resumed):
     runs.fit(tmp_path, 1, runs.module(learning_rate=1e-3, warmup=1))
@@ -137,6 +138,7 @@ def test_a_new_run_from_a_state_has_rates_of_its_own(runs, tmp_path, resumed):
     assert program.provenance.rendered == 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shortest", [2, 3])
 def test_a_run_without_gradients_ends(tmp_path, runs, shortest):
     program = runs.module(loss=LossConfig(pose=0.0, flow=0.0, target=0.0))

@@ -60,6 +60,7 @@ def refused(fit, capsys):
     return call
 
 
+@pytest.mark.long
 def test_a_run_is_begun_resumed_and_the_start_of_another(fit, refused, capsys, tmp_path):
     fit("--name", "a", "--steps", 2)
     said = capsys.readouterr().out
@@ -96,6 +97,7 @@ def test_a_run_is_begun_resumed_and_the_start_of_another(fit, refused, capsys, t
     assert card["steps"] == 1 and card["started_from"]["card"]["steps"] == 5 and card["licence"] == "MIT"
 
 
+@pytest.mark.long
 def test_what_would_train_nothing_is_refused(refused, tmp_path):
     assert "--steps: 0 steps would train nothing" in refused("--steps", 0)
     assert "model.learning_rate: zero at every step" in refused("--steps", 1, "--model.learning_rate", 0)

@@ -79,6 +79,7 @@ def configuration(folder, steps, watched=False):
     return file
 
 
+@pytest.mark.long
 def test_from_a_configuration_to_a_trajectory(tmp_path, command, capsys):
     command("fit", "--config", configuration(tmp_path / "whole", 4, watched=True))
     command("fit", "--config", configuration(tmp_path / "parts", 2))
@@ -140,6 +141,7 @@ def test_settings_that_neither_task_nor_engine_has():
         make_program("none")
 
 
+@pytest.mark.long
 def test_a_study_of_another_task(tmp_path):
     config = StudyConfig(
         folder=str(tmp_path), task=NAME, frames=2, size=(48, 64), start={}, start_steps=1, steps=2, seeds=(0,),

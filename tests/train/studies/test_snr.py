@@ -42,6 +42,7 @@ def test_gradients_of_a_clip_differ_by_variant_and_leave_the_network_alone(runs)
     assert all(p.grad is None for p in model.parameters())
 
 
+@pytest.mark.long
 def test_the_command_reads_a_training_state(tmp_path, runs, capsys):
     runs.fit(tmp_path, 1)
     main([str(tmp_path / "last.ckpt"), "--clips=2", "--frames=3", "--updates=2", "--patches=4", "--size", "48", "64"])

@@ -35,6 +35,7 @@ def program(teacher, **changes):
     return make_program("distil", **({"teacher": teacher, "warmup": 1, "learning_rate": 3e-3} | changes))
 
 
+@pytest.mark.long
 def test_the_loss_falls_and_the_update_operator_is_held(tmp_path, runs, teacher):
     one = program(teacher, augmentation=Augmentation(colour=0.0, zoom=0.5, exposure=0.5))
     given = {name: value.clone() for name, value in one.net.update.state_dict().items()}
@@ -109,6 +110,7 @@ def test_agreeing_share():
     assert agreeing_share(maps, moved, 3) < 0.2
 
 
+@pytest.mark.long
 def test_the_shipped_configurations(tmp_path, runs, command):
     """A short run of each, the second from the state of the first."""
     for name, more in (("distil", []), ("light", ["--from", tmp_path / "distil" / "last.ckpt"])):

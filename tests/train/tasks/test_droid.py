@@ -130,6 +130,7 @@ def test_the_upsampled_depth_is_compared_at_the_resolution_of_the_image(runs):
     assert found["loss_upsampled"] < 1e-4
 
 
+@pytest.mark.long
 def test_the_loss_falls_within_some_steps(runs):
     one = program(updates=2)
     batch = runs.batch(0, **SIZES)
@@ -145,6 +146,7 @@ def test_the_loss_falls_within_some_steps(runs):
     assert targets[-1] < 0.8 * targets[0]
 
 
+@pytest.mark.long
 def test_resumed_training_equals_uninterrupted_training(tmp_path, runs):
     options = {"flow_steps": 1, "further": 2, "reach": 1}
     runs.check_resuming(tmp_path, 3, lambda: program(**options))

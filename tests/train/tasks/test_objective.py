@@ -150,6 +150,7 @@ def test_depth_that_is_not_known_leaves_the_poses_to_learn_from():
         assert torch.isfinite(state.poses_cw.grad).all() and state.poses_cw.grad.abs().sum() > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("clips", [pytest.param(20, id="20"), pytest.param(50, id="50", marks=pytest.mark.slow)])
 def test_exact_targets_from_identity_find_the_rotation(clips):
     """Inverse depths start at 1: at least 90 % of rendered clips end with a rotation error under 2 % of the motion."""

@@ -60,6 +60,7 @@ def test_the_full_network_takes_a_step_of_dpvos_recipe(tmp_path, runs):
     assert int(program.skipped) == 0 and not bool(program.warming)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "changes",
     [
@@ -119,6 +120,7 @@ def test_the_penalty_for_trends_weights_the_flow_and_is_off_by_default(tmp_path,
     assert runs.module().task.loss.balance == "none" and runs.module().task.trend.value == 1
 
 
+@pytest.mark.long
 def test_the_penalty_goes_on_after_a_stop(tmp_path, runs):
     whole, losses = runs.fit(tmp_path, 4, runs.module(loss=TREND))
     runs.fit(tmp_path, 2, runs.module(loss=TREND))

@@ -53,6 +53,7 @@ def test_a_lesson_without_trust_teaches_nothing(runs):
     assert all(p.grad is None or (p.grad == 0).all() for p in one.net.parameters())
 
 
+@pytest.mark.long
 def test_the_loss_falls_without_labels(runs):
     """A student away from its teacher comes back to it, on clips that it sees degraded."""
     one = program(limits=replace(ALL, share=0.0), degradation=Degradation(noise=1.0, light=0.0, blur=0.0))

@@ -71,6 +71,7 @@ def test_a_crop_changes_flow_and_intrinsics_together(runs):
     torch.testing.assert_close(ratio, torch.full((2,), scale), atol=0.1, rtol=0.05)
 
 
+@pytest.mark.long
 def test_the_loss_falls_within_some_steps(runs):
     one = program()
     batch = runs.batch(0, 1, sizes=[(64, 96)])
@@ -141,6 +142,7 @@ def test_bad_weights_of_the_loss_are_refused(change):
         LossConfig(**change)
 
 
+@pytest.mark.long
 def test_the_shipped_configuration_trains_and_resumes(tmp_path, runs, command):
     """With sizes for a test; the network is exported, loaded and gives a flow."""
     pytest.importorskip("kornia")

@@ -76,6 +76,7 @@ def test_ctrl_c_ends_a_validation(clip, fake_odometry):
         track_sequence(fake_odometry(at_frame={2: interrupt}), frames, truth)
 
 
+@pytest.mark.long
 def test_the_picture_shows_the_flow_of_the_last_window(clip, tmp_path):
     frames, truth = clip
     torch.manual_seed(0)

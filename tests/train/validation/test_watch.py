@@ -49,6 +49,7 @@ def test_random_states_are_put_back():
     assert (random.random(), np.random.rand(), float(torch.rand(()))) == expected  # noqa: NPY002
 
 
+@pytest.mark.long
 def test_trained_weights_are_validated_before_the_first_step(tmp_path, runs, capsys):
     program = runs.module()
     program.from_trained = True

@@ -10,6 +10,7 @@ from dvo.core.yaml_files import read_yaml
 from train.studies.family.process import apart
 
 
+@pytest.mark.long
 def test_errors_of_a_process_are_printed_by_it(tmp_path, capfd):
     apart(os.mkdir, tmp_path / "made")
     assert (tmp_path / "made").is_dir()
@@ -19,6 +20,7 @@ def test_errors_of_a_process_are_printed_by_it(tmp_path, capfd):
     assert capfd.readouterr().err.startswith("error: absent.yaml: ")
 
 
+@pytest.mark.long
 def test_an_end_by_a_signal_is_told(capfd):
     with pytest.raises(SystemExit) as ended:
         apart(os.abort)

@@ -182,6 +182,7 @@ def bad_habits(file: Path, nodes: list[ast.AST]) -> Iterator[str]:
         yield f"{name(file)}:{node.lineno} {fault}"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("folder", ["dvo", "train", "eval"])
 def test_habits(folder: str) -> None:
     wrong = [fault for file in EVERYTHING if name(file).startswith(folder) for fault in look(file)[1]]

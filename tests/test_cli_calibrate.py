@@ -54,6 +54,7 @@ def test_calibrates_and_runs_with_the_file(folder, tmp_path, capsys, monkeypatch
     assert used["fx"] == pytest.approx(facts["parameters"]["fx"]["value"], abs=1e-5) and used["model"] == "radtan"
 
 
+@pytest.mark.long
 def test_a_fisheye_is_written_as_yaml(folder, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["calibrate", str(folder), "--board", "5x4", "--fisheye", "--out", str(out)]) == 0

@@ -150,6 +150,7 @@ DIALECTS = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dialect", DIALECTS)
 def test_dialects_that_calib_takes(dialect, image_folder, tmp_path):
     name, text = DIALECTS[dialect]

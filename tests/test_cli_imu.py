@@ -62,6 +62,7 @@ def checked(capsys: pytest.CaptureFixture[str], *line: str) -> tuple[int, str, s
     return code, said.out, said.err
 
 
+@pytest.mark.long
 def test_a_sequence_against_its_camera(sequence, imu, monkeypatch, tmp_path, capsys):
     odometries = []
 
@@ -95,6 +96,7 @@ def test_samples_that_a_reader_refuses_are_opened_and_named(sequence, imu, capsy
     assert "duplicate stamps" in out and "unordered stamps: time goes back 1 times" in out
 
 
+@pytest.mark.long
 def test_a_table_alone_and_one_beside_images(sequence, imu, tmp_path, capsys):
     in_g = InertialSamples(imu.timestamps, imu.gyro, imu.accel / 9.80665)
     file = write(sequence, in_g)

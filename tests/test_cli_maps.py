@@ -26,6 +26,7 @@ class SavingOdometry(FakeOdometry):
         Path(file).write_text(f"{len(self.frames)} frames")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stopped", [None, signal.SIGINT, signal.SIGTERM])
 def test_a_map_is_saved_at_the_end_and_after_an_interruption(stopped, monkeypatch, image_folder, tmp_path):
     at_frame = {} if stopped is None else {8: lambda: os.kill(os.getpid(), stopped)}

@@ -28,6 +28,7 @@ def test_the_clip_is_the_same_every_time_and_moves():
     assert first.groundtruth.path_length > 0.01
 
 
+@pytest.mark.long
 def test_threads_render_what_one_does_and_stop_when_asked_to(monkeypatch):
     sequence = make_sequence(0, frames=40, family="room")
     for one, several in zip(_frames(sequence, 1), [*zip(range(6), _frames(sequence, 3), strict=False)], strict=False):

@@ -63,6 +63,7 @@ def tracked(seconds: float, pose_wc: np.ndarray | None, **more: object) -> dvo.E
 # --- frames and covariance -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @given(first=vectors, step=vectors, extrinsics=vectors)
 def test_base_moves_as_the_camera_does(first, step, extrinsics):
     """The first pose is the identity; the mean velocity leads from one pose to the next."""

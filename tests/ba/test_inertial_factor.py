@@ -62,6 +62,7 @@ def random_case(seed: int, *, turn: float = 0.5, frames: int = 3) -> tuple[Inert
     return factor, {**blocks, POSES: pose_block(poses, 0)}
 
 
+@pytest.mark.long
 @settings(max_examples=4, deadline=None)
 @given(seeds, st.sampled_from([1e-6, 0.1, 0.5]))
 def test_jacobians_of_all_blocks(seed: int, turn: float) -> None:

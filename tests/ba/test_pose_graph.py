@@ -158,6 +158,7 @@ def test_consistent_similarities_are_recovered():
     torch.testing.assert_close(centres(result.poses_cw), centres(poses), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_kernel_limits_a_false_loop():
     poses, ii, jj, _, _ = circle(40, 0.0)
     measured = sim3.compose(poses[jj], sim3.inverse(poses[ii]))
@@ -404,6 +405,7 @@ def folder(data_root: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_the_initial_chi2_of_every_file(folder: Path):
     expected = json.loads((folder / "initial_chi2.json").read_text(encoding="utf-8"))
     assert len(expected) >= 8

@@ -46,6 +46,7 @@ def test_known_cameras_are_recovered(boards, case, tmp_path):
     assert f"px (RMS); corners in {found.coverage:.0%} of the image" in file.read_text()
 
 
+@pytest.mark.long
 def test_views_that_do_not_fit_are_rejected(boards):
     """A view of a picture that was squeezed after it was taken."""
     scene = boards.Scene(boards.RADTAN, boards.checkerboard(7, 5))
@@ -64,6 +65,7 @@ def test_a_board_that_faces_the_camera_is_refused(boards):
         calibrate_board(scene.frames(scene.poses(10, tilt=0.0)), Checkerboard(7, 5), name="video.mp4")
 
 
+@pytest.mark.long
 def test_no_board_too_few_views_no_frames(boards):
     scene = boards.Scene(boards.RADTAN, boards.checkerboard(7, 5))
     frames = scene.frames(scene.poses(4))

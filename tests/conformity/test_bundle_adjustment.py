@@ -106,6 +106,7 @@ def by_gtsam(gtsam, given: dict[str, torch.Tensor]) -> tuple[torch.Tensor, np.nd
     return torch.from_numpy(matrices), depths, graph.error(found)
 
 
+@pytest.mark.long
 def test_the_minimum_is_that_of_gtsam() -> None:
     """By the sparse solver and by the differentiable layer."""
     gtsam = pytest.importorskip("gtsam", reason="pip install gtsam")

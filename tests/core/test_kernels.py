@@ -112,6 +112,7 @@ exec(compile(open({str(file)!r}).read(), {str(file)!r}, "exec"))
     assert run(["-c", full]).stdout.strip() == "1000.0 nan"
 
 
+@pytest.mark.long
 def test_functions_of_other_programs_are_compiled_without_a_line():
     program = "import numba, dvo.core.compiled; print(numba.njit(lambda x: x + 1)(1))"
     found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)

@@ -22,6 +22,7 @@ def near(a, b):
     return np.allclose(pose_matrices(a), pose_matrices(b), atol=1e-9)
 
 
+@pytest.mark.long
 @given(st.lists(poses, min_size=1, max_size=5), poses, poses)
 def test_the_base_moves_as_it_did(bases, extrinsics, world):
     """Cameras made from known poses of the base, in any world, give back the motion of the base."""

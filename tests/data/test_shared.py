@@ -20,6 +20,7 @@ CLIPS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "kind", "count", "size", "intrinsics", "path"), CLIPS, ids=[c[0] for c in CLIPS])
 def test_sequences(data_root, name, kind, count, size, intrinsics, path):
     source = open_source(data_root / name, stride=10 if count > 100 else 3)

@@ -24,6 +24,7 @@ def run(folder, *names, seeds=(-1, 0), seconds=1.0, resident=None) -> dict[tuple
     return {(outcome.target, outcome.seed): outcome for outcome in run_cases(cases, folder, jobs=2, limits=limits)}
 
 
+@pytest.mark.long
 def test_refused_and_accepted(tmp_path):
     found = run(tmp_path, "good", "accepting", seeds=(-1, 0, 1, 2))
     assert [found["good", seed].verdict for seed in (-1, 0, 1, 2)] == ["accepted"] + ["refused"] * 3

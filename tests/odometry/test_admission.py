@@ -120,6 +120,7 @@ def unreadable():
     raise DvoError("cannot be read", field="depth", remedy="replace it")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("at", [0, 3, 7])
 def test_a_frame_that_failed_is_not_there_and_the_next_one_repeats_nothing(at):
     """Its depth is read while it is processed; the image comes again with a depth that can be read."""

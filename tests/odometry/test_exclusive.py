@@ -72,6 +72,7 @@ def test_a_new_beginning_waits_for_the_frame():
     assert odometry.current().frames_read == 1, "of the frame after it"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("member", MEMBERS)
 def test_every_odometry_finishes_a_frame_first(member):
     """The image of the last frame is read within ``track``, and meanwhile another thread asks for the result."""

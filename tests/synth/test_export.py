@@ -87,6 +87,7 @@ def test_flow_knows_what_is_hidden_and_out_of_view() -> None:
     assert (mask[7:13, 17:20] == OCCLUDED).all() and (mask[:4, 5:] == 0).all()
 
 
+@pytest.mark.long
 def test_mesh_sequence_reads_back_with_the_background_as_no_depth(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     scene = mesh_scene(trimesh.creation.icosphere(subdivisions=2), ground=False)

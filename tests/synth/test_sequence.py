@@ -63,6 +63,7 @@ class _Frames(Dataset[torch.Tensor]):
         return torch.from_numpy(sequence.frame(index).image)
 
 
+@pytest.mark.long
 def test_sequence_is_a_source_of_frames() -> None:
     sequence = make_sequence(4, frames=5, height=48, width=64, fps=10, family="room")
     frames = list(sequence)

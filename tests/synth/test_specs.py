@@ -37,6 +37,7 @@ def test_options_of_the_rendered_suites_are_known() -> None:
         sequence_spec(**table["common"], **axis["options"])
 
 
+@pytest.mark.long
 def test_specification_and_flat_options_give_the_same_bytes() -> None:
     spec = SequenceSpec(SequenceFormat(3, 32, 48, 10.0), SceneSpec("room", texture=0.5), MotionSpec("fast"))
     flat = make_sequence(2, frames=3, height=32, width=48, fps=10.0, family="room", texture=0.5, kind="fast")

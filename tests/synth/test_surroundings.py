@@ -39,6 +39,7 @@ def test_what_it_covers_is_marked_and_nothing_else_changes(name):
     assert not np.array_equal(with_it.frame(2).image, sequence(name, seed=4).frame(2).image)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SURROUNDINGS)
 def test_it_moves_before_a_camera_that_stands_still(name):
     """All but a bonnet, whose reflections alone do, and a border, of which a propeller does."""

@@ -118,6 +118,7 @@ def test_warped_frame_is_the_same_picture() -> None:
     assert np.median(np.array(unmoved) / errors) > 3, "the frames hardly differ: the test shows nothing"
 
 
+@pytest.mark.long
 def test_without_bodies_moving_pixels_the_static_flow_is_wrong(scene: Scene) -> None:
     shot = make_shot(scene, bodies=6)
     mask = dynamic_mask(shot, TIMES[0])
@@ -135,6 +136,7 @@ def test_without_bodies_moving_pixels_the_static_flow_is_wrong(scene: Scene) -> 
                           [-1, 0, 1, len(shot.scene.bodies)])  # fmt: skip
 
 
+@pytest.mark.long
 def test_occluded_pixels_are_hidden_by_something_nearer(scene: Scene) -> None:
     shot = make_shot(scene, bodies=4)
     result = optical_flow(shot, 0.2, 0.8)

@@ -149,6 +149,7 @@ def test_data_of_a_short_run():
     np.testing.assert_allclose(floats(world["keyframes"]), trajectory.positions[3], atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_long_run_stays_small_and_keeps_peaks(tmp_path):
     trajectory = walk(50_000)
     errors = np.zeros(50_000)

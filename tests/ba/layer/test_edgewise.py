@@ -87,6 +87,7 @@ def assert_equal(found: BAResult, expected: BAResult) -> None:
     assert expected.inliers is not None and torch.equal(found.inliers, expected.inliers)
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.integers(0, 10_000), st.integers(1, 2), st.sampled_from([0, 1, 5, 40, 90]),

@@ -42,6 +42,7 @@ def test_the_pattern_drops_what_is_outside_and_keeps_the_diagonal():
     assert pattern.diagonal.tolist() == [0, 1, 3, 4]
 
 
+@pytest.mark.long
 @given(st.integers(1, 40), st.sampled_from([6, 7]), st.integers(0, 80), st.integers(0, 10_000))
 def test_products_and_solutions_are_the_dense_ones(n: int, dim: int, pairs: int, seed: int):
     matrix = random_matrix(n, dim, pairs, seed)

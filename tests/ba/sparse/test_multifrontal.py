@@ -28,6 +28,7 @@ def random_matrix(size: int, edges: int, dim: int, seed: int) -> BlockMatrix:
     return BlockMatrix(pattern, blocks)
 
 
+@pytest.mark.long
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 60), st.integers(0, 150), st.sampled_from([1, 2, 3, 6, 7]), st.integers(0, 10_000))
 def test_the_solution_is_that_of_dense_algebra(size: int, edges: int, dim: int, seed: int):

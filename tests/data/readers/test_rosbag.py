@@ -237,6 +237,7 @@ def stereo(bag, make):
     bag.info("/cam1/camera_info", p=[*P[:3], -P[0] * 0.12, *P[4:]])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
 @pytest.mark.parametrize("right", ["/cam1/image_raw", None])
 def test_right_images_of_another_topic(make, kind, right):

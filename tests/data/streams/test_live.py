@@ -196,6 +196,7 @@ def test_an_error_at_the_end_of_a_generator_reaches_the_consumer():
         live.peek(LIMIT)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("use", ["started", "looked at", "iterator", "iterating", "full", "in a cycle"])
 def test_a_stream_without_references_ends_its_thread(use):
     """Without ``stop`` or ``close``: a camera would stay open as long as the process."""

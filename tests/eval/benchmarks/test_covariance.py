@@ -89,6 +89,7 @@ def walk(frames):
     return make_sequence(61, frames=frames, family="room", kind="handheld", speed=3.0, **size)
 
 
+@pytest.mark.long
 def test_frames_bring_what_the_scale_comes_from(monkeypatch):
     sequence = walk(2)
     plain, deep, pair = (list(frames_of(sequence, scale, 0.3))[1] for scale in ("none", "depth", "stereo"))

@@ -144,6 +144,7 @@ def test_styles_are_told_apart_without_colour():
     assert len({style.color for name, style in found.items() if not name.startswith("dvo")}) == len(names) - 1
 
 
+@pytest.mark.long
 def test_figures_survive_what_runs_leave_behind():
     """No poses, one pose, all failed, far off, dark stretches."""
     s = np.linspace(0, 5, 900)
@@ -173,6 +174,7 @@ def test_axes_keep_their_digits_and_coordinates_lose_theirs():
     assert not re.search(r" (?:d|x|y)=\"[^\"]*\d\.\d{3}", drawn)
 
 
+@pytest.mark.long
 def test_segments_are_told_apart_in_the_figure():
     """Each in its own world and scale; drawn on the truth, a ring at the start of the second, tiny ones left out."""
     s = np.linspace(0, 5, 200)

@@ -172,6 +172,7 @@ def test_options_are_checked():
         AlignmentOptions(window=1)
 
 
+@pytest.mark.long
 def test_rendered_motion_is_measured_to_a_tenth_of_a_pixel():
     """Starts of half a feature pixel off are brought to the true flow of a rendered clip."""
     torch.manual_seed(0)

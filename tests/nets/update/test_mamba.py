@@ -113,6 +113,7 @@ def test_the_recurrence_over_updates_is_the_selective_recurrence():
     torch.testing.assert_close(hidden[0].unflatten(-1, (HISTORY_STATES, -1)), last)
 
 
+@pytest.mark.long
 def test_the_state_stays_bounded_over_many_updates(update):
     graph = drawn_graph(1)
     inputs = inputs_of(graph)

@@ -214,6 +214,7 @@ def test_frames_of_a_fast_camera_are_left_out(clip):
     assert seen == list(range(0, 12, 2))
 
 
+@pytest.mark.long
 def test_frames_that_cannot_be_read_end_the_estimate_only(clip):
     class Broken:
         """Source that can be read again and again, up to a fault."""

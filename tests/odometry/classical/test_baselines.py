@@ -53,6 +53,7 @@ def test_start_is_back_filled(film, path):
     assert steps.max() * metrics.scale < 0.01
 
 
+@pytest.mark.long
 def test_short_blackout_is_lost_and_found(film, path, dark):
     estimates, result = run(dark(film(path(60)), 25, 28))
     assert [(e.status, e.pose_wc) for e in estimates[25:28]] == [(Status.LOST, None)] * 3

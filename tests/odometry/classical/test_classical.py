@@ -72,6 +72,7 @@ def test_rendered_sequence(name, rendered):
     assert metrics.completeness == 1 and metrics.ate_percent < 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "most"), [("klt-pnp", 0.05), ("keyframe", 0.05), ("direct", 0.1)])
 def test_pure_rotation_turns_and_does_not_move(name, film, path, most):
     turning = path(30, translate=0.0)

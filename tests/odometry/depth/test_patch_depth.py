@@ -126,6 +126,7 @@ def test_the_window_holds_the_depths_of_its_patches(size):
     np.testing.assert_array_equal(odometry.window.patches[:, 2, 1, 1].numpy(), measured[:, 0])
 
 
+@pytest.mark.long
 def test_depth_that_is_not_asked_for_is_not_read_and_changes_no_byte():
     def refuse():
         raise AssertionError("depth was read")
@@ -143,6 +144,7 @@ def test_depth_that_is_not_asked_for_is_not_read_and_changes_no_byte():
     assert "scale" not in poses[0].info and not poses[0].metric
 
 
+@pytest.mark.long
 def test_frames_without_depth_are_tracked_as_without_the_option():
     """Without a single measured depth every byte is the same, and the scale is told as unknown."""
     results = []

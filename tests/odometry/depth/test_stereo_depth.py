@@ -54,6 +54,7 @@ def observed(model, frame, patches=64):
     return observe(model, frame.image, frame.camera, select, torch.device("cpu"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mount", [PARALLEL, TURNED], ids=["parallel", "turned"])
 @torch.inference_mode()
 def test_depths_of_a_rendered_pair(model, mount):
@@ -160,6 +161,7 @@ def test_right_images_that_are_not_asked_for_are_not_read_and_change_no_byte():
     assert np.array_equal(*poses)
 
 
+@pytest.mark.long
 def test_frames_without_right_images_are_tracked_as_without_the_option():
     results = []
     for scale in (ScaleOptions(), STEREO):

@@ -225,6 +225,7 @@ def test_a_random_network_tracks_a_clip(model, clip):
     assert len(result.depth) == 12 == result.info["keyframes"]
 
 
+@pytest.mark.long
 def test_the_same_frames_give_the_same_bytes(model, clip):
     a, b = (run(DroidOdometry(model, EVERY), frames_of(clip)[:6]).result for _ in range(2))
     assert a.trajectory.poses_wc.tobytes() == b.trajectory.poses_wc.tobytes()

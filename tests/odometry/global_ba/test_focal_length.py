@@ -62,6 +62,7 @@ def test_few_frames_conclude_nothing():
     assert found.minimum.deviation == np.inf and found.contrast == 0 and found.minimum.value == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("factor", "readout"), [(0.75, 0.0), (1.0, 0.0), (1.0, 0.06)])
 def test_a_quick_look_tells_a_wrong_focal_length_from_a_right_one(factor, readout, monkeypatch):
     """Of a right one the coarse profile is enough; dropped frames may be left out."""

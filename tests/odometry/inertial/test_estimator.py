@@ -123,6 +123,7 @@ def test_a_rotation_between_sensor_and_camera_that_is_not_stated_is_found() -> N
     assert estimator.worlds[0].scale == pytest.approx(SCALE, rel=0.06)  # the lever arm is not known
 
 
+@pytest.mark.long
 def test_an_alignment_that_fails_later_is_withdrawn() -> None:
     recording = record(5, seconds=12.0)
     s = recording.samples

@@ -103,6 +103,7 @@ def test_bias_jacobians_equal_finite_differences(seed: int) -> None:
     assert np.allclose(velocity, other.velocity, atol=1e-5) and np.allclose(position, other.position, atol=1e-5)
 
 
+@pytest.mark.long
 def test_the_covariance_is_that_of_monte_carlo_runs() -> None:
     """3000 runs of 100 samples: every standard deviation within 8 %, every correlation within 0.08 (deviation of a
     sampled correlation: 0.02)."""

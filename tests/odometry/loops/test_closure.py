@@ -37,6 +37,7 @@ def kind(loops):
     return None if loops.maintenance.job is None else loops.maintenance.job.kind
 
 
+@pytest.mark.long
 def test_loops_are_found_where_the_way_is_repeated(film, closed):
     odometry, _, result = closed
     loops = result.info["loops"]
@@ -80,6 +81,7 @@ def turned_away(finder):
     return replace(search, pairs=(pair,), predicted=0)
 
 
+@pytest.mark.long
 def test_a_place_is_recognised_from_a_wrong_start(closed):
     """The network alone does not find the way from a view that is 30 degrees off; the guessed pose is near enough."""
     finder = closed[0].loops.finder
@@ -96,6 +98,7 @@ def test_a_place_is_recognised_from_a_wrong_start(closed):
         assert all_steps(finder.verify(predicted)) is None
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_match_ends_once_further_updates_change_nothing(closed, monkeypatch):
     """Asked of several pairs: how far a single one goes on moving depends on its view."""
@@ -126,6 +129,7 @@ def test_a_match_ends_once_further_updates_change_nothing(closed, monkeypatch):
     assert np.median(errors, axis=0)[0] < 0 and (np.median(errors, axis=0)[1:] < 1).all()
 
 
+@pytest.mark.long
 def test_a_match_with_few_inliers_has_to_agree_with_the_poses(closed, monkeypatch):
     finder = closed[0].loops.finder
     search = turned_away(finder)
@@ -141,6 +145,7 @@ def test_a_match_with_few_inliers_has_to_agree_with_the_poses(closed, monkeypatc
         assert all_steps(finder.verify(drifted)) is not None
 
 
+@pytest.mark.long
 def test_a_keyframe_long_after_the_one_before_counts_more(closed):
     finder = closed[0].loops.finder
     times = np.array([finder.graph.archive[k].timestamp for k in finder.kept])
@@ -155,6 +160,7 @@ def test_a_keyframe_long_after_the_one_before_counts_more(closed):
     assert (np.diff(replace(finder, pace=0.125).counted()) == found[1:]).all()
 
 
+@pytest.mark.long
 def test_at_the_end_keyframes_that_are_far_apart_are_all_searched(closed, monkeypatch):
     closer, found = closed[0].loops, {}
     finder = closer.finder
@@ -177,6 +183,7 @@ def correcting(film):
     return until(film, lambda loops: kind(loops) == "correction")[0]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_saving_leaves_work_in_progress_alone(film, closed, tmp_path):
     """Maps are those before the result of a search, or a correction, is there."""
@@ -270,6 +277,7 @@ def test_an_interruption_while_a_frame_waits_leaves_the_work(correcting, monkeyp
     assert loops.advance([0], at_once=True) and loops.corrections == 1
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_search_at_once_finds_the_same_places(film, closed):
     """Without a delay, searches and corrections are done within ``track``."""
@@ -296,6 +304,7 @@ def test_in_real_time_a_frame_does_not_wait_for_a_search(monkeypatch):
     assert odometry.finish().info["loops"] is not None and odometry.loops.maintenance.job is None
 
 
+@pytest.mark.long
 def test_a_search_that_fails_ends_the_frame_that_takes_its_result(film, monkeypatch):
     odometry = dvo.load("small", device="cpu", loop=OPTIONS, **SHORT)
 
@@ -309,6 +318,7 @@ def test_a_search_that_fails_ends_the_frame_that_takes_its_result(film, monkeypa
             odometry.track(frame)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_without_loops_nothing_is_searched_or_kept(film, closed):
     odometry, estimates, result = track(film[0], loops=False)
@@ -360,6 +370,7 @@ def test_a_wrong_loop_is_not_confirmed(film, monkeypatch):
     assert len(calls) > 1 and not odometry.loops.loops and odometry.loops.corrections == 0
 
 
+@pytest.mark.long
 def test_keyframes_of_a_segment_that_is_not_initialised_are_left_alone(closed):
     loops = closed[0].loops
     fresh = LoopCloser(loops.graph, replace(loops.finder, kept=[]))

@@ -137,6 +137,7 @@ def test_the_thread_gives_way_to_tracking():
         assert there == min(own + 5, 19)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 def test_a_forked_process_does_not_wait_for_the_thread():
     """It has none: what was begun is an error at once, what had ended is there, and new work gets a thread."""

@@ -116,6 +116,7 @@ def test_poses_turn_upright_and_metric_and_so_does_the_result() -> None:
     assert np.isfinite(so_far.trajectory.poses_wc).all() and len(so_far.trajectory) == len(result.trajectory)
 
 
+@pytest.mark.long
 def test_frames_without_a_view_are_predicted_and_never_counted_as_tracked() -> None:
     odometry = tracker()
     images = with_samples(dark(frames(16), 12, 16))

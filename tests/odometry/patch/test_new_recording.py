@@ -136,6 +136,7 @@ def test_another_place_is_not_recognised(elsewhere):
     assert set(result.trajectory.timestamps) <= {k / 15 for k in range(16)}
 
 
+@pytest.mark.long
 def test_a_map_in_progress_without_loops_is_described(walk, tmp_path):
     odometry = dvo.load("small", device="cpu", **SHORT, loops=False)
     for frame in walk[0][14:30]:
@@ -156,6 +157,7 @@ def test_a_map_in_progress_without_loops_is_described(walk, tmp_path):
                 tracker_.track(wall(1, size=size)[0])
 
 
+@pytest.mark.long
 def test_the_keyframes_of_the_window_have_the_same_descriptors_as_computed_from_their_images(walk, tmp_path):
     """Those of the map of a sequence in progress come from the tracker; they agree with the archived image."""
     odometry = dvo.load("small", device="cpu", **SHORT)

@@ -107,6 +107,7 @@ def test_frames_out_of_order_or_of_another_size_are_refused():
     assert odometry.finish().frames_read == 1
 
 
+@pytest.mark.long
 def test_a_buffer_that_is_used_again_for_every_frame():
     images = frames(9)
     buffer = np.zeros_like(images[0].image)

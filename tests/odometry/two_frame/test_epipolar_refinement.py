@@ -71,6 +71,7 @@ def test_wrong_flows_do_not_decide(seed):
     assert robust[0] < min(5, 0.5 * squares[0]) and robust[1] < min(0.5, 0.5 * squares[1])
 
 
+@pytest.mark.long
 def test_the_cost_is_least_where_a_plain_search_finds_it():
     """The same cost, minimised by scipy without derivatives from the same start."""
     flow, true = views(3)

@@ -53,6 +53,7 @@ def same(one, other):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("back", [0, 1])
 def test_what_is_not_supported_leaves_no_trace(tried, back):
     odometry, view = tried
@@ -62,6 +63,7 @@ def test_what_is_not_supported_leaves_no_trace(tried, back):
     assert same(content(odometry.patch_window), before)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("back", [0, 1])
 def test_what_is_supported_is_part_of_the_window(tried, back):
     odometry, view = tried

@@ -26,6 +26,7 @@ def scene() -> Scene:
     return random_scene(2, "room", pool=texture_pool(11, count=24, size=64))
 
 
+@pytest.mark.long
 def test_bodies_move_rigidly_and_keep_off_the_camera(scene: Scene) -> None:
     path = long_path(scene, 1, "handheld", 4.0)
     bodies = random_bodies(scene, path, 4.0, 7, 4)

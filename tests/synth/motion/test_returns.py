@@ -48,6 +48,7 @@ def test_the_same_way_after_the_jump(duration: float) -> None:
     assert np.abs(np.diff(yaw)).max() <= np.pi + 1e-9
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", ["hall", "gallery"])
 @pytest.mark.parametrize("kind", ["revisit", "return", "kidnap"])
 def test_ways_that_come_back_stay_in_free_space(scenes: dict[str, Scene], kind: str, family: str) -> None:

@@ -91,6 +91,7 @@ def test_no_lens_is_the_pinhole_picture():
     np.testing.assert_allclose(got.depth.numpy(), plain.depth.numpy(), rtol=1e-5)
 
 
+@pytest.mark.long
 def test_what_no_plane_can_hold_is_refused():
     with pytest.raises(DvoError, match="fold the 160x120 picture"):
         plate_of(replace(CAMERA, model="radtan", coefficients=(-2.0, 0.0, 0.0, 0.0)), 2)

@@ -108,6 +108,7 @@ def test_depth_of_a_mesh_agrees_with_embree(things: Path) -> None:
         assert 0.2 < (frames.surface[0].numpy() < len(scene) - 2).mean() < 0.9, "the things are not in view"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", list(FAMILIES))
 def test_depth_of_families_agrees_with_embree(family: str) -> None:
     """Our scenes as triangles; where Embree sees the back of a one-sided surface, nothing is compared."""

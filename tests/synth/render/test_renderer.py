@@ -45,6 +45,7 @@ def into(points: np.ndarray, pose_wc: np.ndarray, k: np.ndarray = K) -> tuple[np
     return local[..., :2] / local[..., 2:] * k[:2] + k[2:], local[..., 2]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", list(SHARES))
 def test_pixel_lands_on_same_surface_and_texture_coordinate(pool: TexturePool, family: str) -> None:
     scene, poses = two_views(pool, family)

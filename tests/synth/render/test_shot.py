@@ -58,6 +58,7 @@ def test_rolling_rows_are_those_of_their_own_times(scene: Scene) -> None:
     assert not torch.equal(middle.surface[0, 0], frame.surface[0, 0]), "the top row is read earlier than the middle"
 
 
+@pytest.mark.long
 def test_blur_is_the_mean_along_the_path(scene: Scene) -> None:
     shot = make_shot(scene, bodies=2, exposure=0.4)
     middle = shot.sharp(0.5)

@@ -56,6 +56,7 @@ def test_jpeg_loses_detail_by_quality(plain: SyntheticSequence) -> None:
     assert 0 < errors[0] < errors[1] < errors[2] < 0.1
 
 
+@pytest.mark.long
 def test_sensor_wear_of_clips_is_rare_and_has_its_own_draws() -> None:
     worn = [
         random_degradation(np.random.default_rng([0, salts.CLIP_DEGRADATION, i]), Sensor(), 1.0) for i in range(400)

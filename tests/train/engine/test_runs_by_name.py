@@ -115,6 +115,7 @@ def test_a_run_that_trained_nothing_is_an_error(fit, options, capsys):
     assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
 
 
+@pytest.mark.long
 def test_options_that_do_not_parse_are_one_line(refused):
     assert "unrecognized arguments: --nonsense" in refused("--nonsense")
     assert "model.learning_rate: Expected a float. Got value: abc" in refused("--model.learning_rate", "abc")

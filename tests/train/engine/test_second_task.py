@@ -117,6 +117,7 @@ def test_from_a_configuration_to_a_trajectory(tmp_path, command, capsys):
     assert "pure noise would have about 0.500" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_a_task_by_module_and_class(runs, tmp_path):
     """Without any registration of the task; the state goes on under the same name only."""
     TASKS.unregister(NAME)

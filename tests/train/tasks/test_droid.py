@@ -182,6 +182,7 @@ def test_clips_without_depth_train_the_poses_alone(runs):
     assert all(torch.isfinite(p.grad).all() for p in one.net.parameters() if p.grad is not None)
 
 
+@pytest.mark.long
 def test_bfloat16_stays_near_full_precision(runs):
     one, batch = program(), runs.batch(0, **SIZES)
     plain = one.task.compute_loss(StepContext(one.net, 0, {}), batch).loss

@@ -87,6 +87,7 @@ def test_the_loss_falls_within_some_steps(runs):
     assert losses[-1][0] < 0.7 * losses[0][0] and losses[-1][1] < 0.5 * losses[0][1]
 
 
+@pytest.mark.long
 def test_resumed_training_equals_uninterrupted_training(tmp_path, runs):
     pytest.importorskip("kornia")
     options = {"augmentation": Augmentation(zoom=1.0, zoom_range=1.3), "true_flow_until": 2}

@@ -94,6 +94,7 @@ def test_too_little_to_learn_from():
         train([], 10, 4, 0)
 
 
+@pytest.mark.long
 def test_command_is_deterministic(tmp_path: Path, capsys):
     small = ["--sequences", "1", "--frames", "1", "--features", "120", "--branching", "4", "--depth", "2"]
     for name in ("a", "b"):

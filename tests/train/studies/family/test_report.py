@@ -66,6 +66,7 @@ def test_the_page_holds_what_the_tables_hold(config):
     assert picture.read_bytes().startswith(b"<?xml")
 
 
+@pytest.mark.long
 def test_the_same_tables_give_the_same_bytes(config):
     records = fill(config, {"a": (0.5, 1.0)})
     before = [file.read_bytes() for file in write_report(records)]

@@ -14,6 +14,7 @@ def same(a, b):
     return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
 
 
+@pytest.mark.long
 def test_an_interrupted_training_ends_as_one_that_was_not(family, tmp_path, monkeypatch):
     config = family()
     whole = train_member(config, "deepvo", 0)

@@ -85,8 +85,8 @@ def change(given: dict[str, Any], kind: str, draw: Callable[..., Any]) -> None:
     elif kind == "shape":
         x = draw(st.sampled_from((x[:1], x[..., :1], x[0], x[:, :1], x[None], x[:0], x[..., :0]))) if len(x) else x
     elif kind == "index" and len(x):
-        x = x.clone()
-        x[draw(st.integers(0, len(x) - 1))] = draw(st.sampled_from((-1, 0, 1, 2, 5, 6, 1000)))
+        x, value = x.clone(), torch.tensor(draw(st.sampled_from((-1, 0, 1, 2, 5, 6, 1000))))
+        x[draw(st.integers(0, len(x) - 1))] = value.to(x.dtype)  # bytes wrap around
     elif kind == "index dtype":
         x = x.to(draw(st.sampled_from((torch.int32, torch.uint8, torch.float32, torch.bool, torch.complex64))))
     elif kind == "still":  # no parallax

@@ -87,12 +87,12 @@ def compare_again(
     assert result.quality is not None
     mine = result.quality
     kept = [_kept(checked_frame(frame)) for frame in islice(frames, 0, FRAMES * stride, stride)]
-    times = {kept[-1].timestamp - frame.timestamp: frame.timestamp for frame in kept}
     # Backward the rows are read from the last one on, which no camera states: without a readout time.
     backward = [
-        replace(frame, timestamp=time, camera=replace(frame.camera, readout=0.0))
-        for time, frame in zip(reversed(times), reversed(kept), strict=True)
+        replace(frame, timestamp=kept[-1].timestamp - frame.timestamp, camera=replace(frame.camera, readout=0.0))
+        for frame in reversed(kept)
     ]
+    times = {turned.timestamp: frame.timestamp for turned, frame in zip(backward, reversed(kept), strict=True)}
     again, stopped = _tracked(build(1), backward, should_stop)
     found = again.trajectory
     forward = Trajectory(np.array([times[time] for time in found.timestamps[::-1]]), found.poses_wc[::-1])

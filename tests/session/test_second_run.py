@@ -111,6 +111,13 @@ def test_a_third_run_decides_where_they_differ(third, verdict):
     assert quality.verdict == verdict and quality.second > 3 and not walks
 
 
+def test_frames_with_equal_times_are_an_error_of_the_library_or_none():
+    """The first run ends before them; the second one meets them."""
+    twice = frames(30)
+    twice[20] = replace(twice[20], timestamp=twice[19].timestamp)
+    assert compare_again(Walk().finish(), lambda number: Walk(), twice).verdict == "good"
+
+
 def test_no_third_run_where_they_agree_or_after_a_stop():
     never = {1: Walk(0.0)}
     assert ran(never.pop).result.quality.verdict == "good" and not never

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from dvo.core.errors import DvoError
+from dvo.data.files.clock import is_number
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
@@ -28,7 +29,7 @@ def read_named_values(text: str, path: Path, remedy: str) -> list[float] | None:
     """
     lines = [re.sub("[,;]", " ", line.split("#")[0]).replace("=", " = ").split() for line in text.splitlines()]
     lines = [line for line in lines if line]
-    if len(lines) > 1 and {len(line) for line in lines} == {2} and not any(map(_is_number, lines[0])):
+    if len(lines) > 1 and {len(line) for line in lines} == {2} and not any(map(is_number, lines[0])):
         lines = lines[1:]  # the header of a table of names and values
     is_named = bool(lines) and lines[0][0].lower() in NAMES
     if is_named and len(lines) == 2 and len(lines[0]) == len(lines[1]) > 3:
@@ -59,11 +60,3 @@ def read_named_values(text: str, path: Path, remedy: str) -> list[float] | None:
         )
     values = [found.get(name, 0.0) for name in NAMES]
     return values if any(values[9:]) else values[:9]
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dvo.ba.cold_start import damping_at
 from dvo.ba.multistart import (
     AS_THEY_ARE,
     COLD_STARTS,
@@ -14,6 +13,7 @@ from dvo.ba.multistart import (
     preferred,
     present,
 )
+from dvo.ba.options import damping_at
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.window import Window
 from dvo.models.step import Revision, StepOptions

@@ -10,8 +10,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from dvo.ba.cold_start import COLD_UPDATES, damping_at
 from dvo.ba.kernels import Kernel
+from dvo.ba.options import COLD_UPDATES, damping_at
 from dvo.map.measured_depths import depth_factors
 from dvo.map.window import Keyframe, Window, WindowSnapshot
 from dvo.models.patch_vo import PatchVO

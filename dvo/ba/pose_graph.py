@@ -19,7 +19,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from dvo.ba.edges import free_slots
+from dvo.ba.blocks import free_slots
 from dvo.ba.kernels import Kernel
 from dvo.ba.limits import HEAVIEST, check_kind
 from dvo.ba.planar_edges import PLANE, cotangent_terms, flattened, in_plane, planar_edges

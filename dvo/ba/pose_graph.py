@@ -29,10 +29,10 @@ from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
 from dvo.ba.sparse.multifrontal import scipy_is_installed
 from dvo.ba.sparse.schur_pattern import make_schur_pattern
 from dvo.ba.tensor_checks import REAL, WHOLE, check_tensor, check_within
+from dvo.core.context import full_precision
 from dvo.core.errors import DvoError
 from dvo.core.threads import use_threads
 from dvo.geometry import se3, sim3, so3
-from dvo.geometry.precision import full_precision
 
 Chart = Literal["log", "split", "quaternion"]
 """Coordinates of an error ``(R, t)`` or ``(s, R, t)``: "log" is the logarithm of the group; "split" is ``[t, log R]``,

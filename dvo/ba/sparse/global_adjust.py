@@ -25,9 +25,9 @@ from dvo.ba.sparse.global_edges import ReprojectionEdges
 from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
 from dvo.ba.sparse.schur_pattern import SchurPattern, make_schur_pattern
 from dvo.ba.tensor_checks import REAL, WHOLE, check_tensor, check_within
+from dvo.core.context import full_precision
 from dvo.core.errors import DvoError
 from dvo.core.threads import use_threads
-from dvo.geometry.precision import full_precision
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,7 @@ from dvo.odometry.patch.saving import save_map
 from dvo.odometry.patch.state import Phase, TrackerState
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import result_of
-from dvo.odometry.uncertainty.measurements import WindowMeasurements
-from dvo.odometry.uncertainty.uncertainty import LaterUncertainty
+from dvo.odometry.uncertainty.uncertainty import LaterUncertainty, WindowMeasurements
 from dvo.odometry.window.frame_alignment import FrameAlignment
 from dvo.odometry.window.motion import flow_magnitude
 from dvo.odometry.window.patch_window import PatchWindow

@@ -10,7 +10,6 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.geometry.camera import Camera
-from dvo.geometry.undistort import needs_undistortion
 
 _MULTIPLE = 8
 
@@ -42,7 +41,7 @@ def working_image(frame: Frame, pixels: int | None) -> tuple[np.ndarray, Camera,
     Raises:
         DvoError: the frame's camera has distortion, which the odometries do not model.
     """
-    if needs_undistortion(frame.camera):
+    if frame.camera.needs_undistortion:
         raise DvoError(
             f"frames with {frame.camera.model} distortion cannot be tracked",
             field="camera",

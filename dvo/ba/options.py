@@ -10,8 +10,9 @@ from typing import Literal, get_args
 
 from torch import Tensor
 
+from dvo.ba.checks import check_number, check_positive, check_range, check_size, check_switch, check_whole
 from dvo.ba.kernels import Kernel
-from dvo.ba.limits import LARGEST, check_number, check_positive, check_range, check_size, check_switch, check_whole
+from dvo.ba.limits import LARGEST
 from dvo.core.errors import DvoError
 from dvo.core.settings import shown
 

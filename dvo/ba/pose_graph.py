@@ -19,20 +19,20 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from dvo.ba.edges import free_slots
+from dvo.ba.blocks import free_slots
+from dvo.ba.checks import REAL, WHOLE, check_kind, check_tensor, check_within
 from dvo.ba.kernels import Kernel
-from dvo.ba.limits import HEAVIEST, check_kind
+from dvo.ba.limits import HEAVIEST
 from dvo.ba.planar_edges import PLANE, cotangent_terms, flattened, in_plane, planar_edges
 from dvo.ba.pose_graph_start import relaxation, spanning_tree
 from dvo.ba.sparse.equations import SparseSystem
 from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
 from dvo.ba.sparse.multifrontal import scipy_is_installed
 from dvo.ba.sparse.schur_pattern import make_schur_pattern
-from dvo.ba.tensor_checks import REAL, WHOLE, check_tensor, check_within
+from dvo.core.context import full_precision
 from dvo.core.errors import DvoError
 from dvo.core.threads import use_threads
 from dvo.geometry import se3, sim3, so3
-from dvo.geometry.precision import full_precision
 
 Chart = Literal["log", "split", "quaternion"]
 """Coordinates of an error ``(R, t)`` or ``(s, R, t)``: "log" is the logarithm of the group; "split" is ``[t, log R]``,

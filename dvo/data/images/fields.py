@@ -18,7 +18,8 @@ _MOVED = 6.0  # grey levels
 _SHARE = 0.005  # least share of pixels that have moved
 _HIGHEST = 1088  # lines; formats with more know no fields
 _WIDTH = 640  # columns that are looked at, about
-_ROUGH = 1.05  # differences of neighbouring lines over those of every second line; 0.5 for a slope, 1 for noise
+_ROUGH = 1.1  # differences of neighbouring lines over those of every second line; 0.5 for a slope, 1 for noise
+_FURTHER = 1.1  # differences to the farthest field over those within an image, at least
 _NEAR = 0.6  # place of the nearest field beside those of the same image, from 0 (as near) to 1 (as far as any)
 
 
@@ -46,7 +47,8 @@ def are_interlaced(images: Iterable[np.ndarray]) -> bool:
         return False
     same, before, after, second = totals.tolist()
     nearest, farthest = sorted((before, after))
-    return same > _ROUGH * second or nearest - same < _NEAR * (farthest - same)
+    is_told = farthest > _FURTHER * same  # of noise all fields are as far apart
+    return same > _ROUGH * second or (is_told and nearest - same < _NEAR * (farthest - same))
 
 
 def _compared(images: Iterable[np.ndarray]) -> Iterator[tuple[float, float, float, float]]:

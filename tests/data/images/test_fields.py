@@ -46,6 +46,12 @@ def test_pictures_that_repeat_and_a_camera_that_starts():
     assert not are_interlaced([pictures[0]] * 6 + pictures)
 
 
+@pytest.mark.parametrize("size", [(48, 64), (240, 320)])
+def test_noise_alone(size):
+    random = np.random.default_rng(4)
+    assert not are_interlaced(random.integers(0, 256, (*size, 3), dtype=np.uint8) for _ in range(16))
+
+
 def test_fine_lines_are_no_fields():
     lines = np.tile(np.uint8([[60], [200]]), (120, 320))[..., None].repeat(3, 2)
     assert not are_interlaced([lines] * 12)

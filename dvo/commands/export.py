@@ -56,8 +56,18 @@ def export(arguments: argparse.Namespace) -> int:
         DvoError: no results folder or map, no such format or segment, options of images that do not fit, a source that
             is not there any more, or a folder that is not empty.
     """
-    folder, name = Path(arguments.source), arguments.to
     check_empty(Path(arguments.out))  # before images are read
+    names = list(dict.fromkeys(name.strip() for name in arguments.to.split(",")))
+    check_formats(names, option="--to")
+    if len(names) == 1:
+        return _export(argparse.Namespace(**{**vars(arguments), "to": names[0]}))
+    folders = {name: str(Path(arguments.out) / name) for name in names}
+    return max(_export(argparse.Namespace(**{**vars(arguments), "to": name, "out": folders[name]})) for name in names)
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    """To one format."""
+    folder, name = Path(arguments.source), arguments.to
     if arguments.every is not None or arguments.count is not None:
         arguments.export_images = arguments.export_images or SOURCE
     check_image_options(arguments, [name], "--to")
@@ -72,7 +82,6 @@ def export(arguments: argparse.Namespace) -> int:
         )
     if name in MAP_FORMATS and name not in TRAJECTORY_FORMATS:
         return _export_recorded(folder, arguments, image_choice(arguments))
-    check_formats([name], option="--to")  # before any file is read
     file = _trajectory_file(folder, arguments.segment)
     if not file.is_file():
         raise DvoError("not a results folder", file=folder, remedy="give a folder that dvo run has written")

@@ -250,8 +250,10 @@ def residuals_and_jacobians(
 
 
 def _upright_ways(poses_cw: Tensor, gravity: Tensor) -> Tensor:
-    """Tangents ``(N, D, 4)`` of a shift in the axes of the camera and of a turn about gravity ``(3,)``, which is ``R g``
-    there: ``Exp(psi R g) R = R Exp(psi g)`` leaves ``R g`` as it is."""
+    """Tangents ``(N, D, 4)`` of a shift in the axes of the camera and of a turn about gravity ``(3,)``.
+
+    Gravity is ``R g`` there, and ``Exp(psi R g) R = R Exp(psi g)`` leaves it as it is.
+    """
     ways = poses_cw.new_zeros(len(poses_cw), poses_cw.shape[-1] - 1, 4)
     ways[:, range(3), range(3)] = 1
     ways[:, 3:6, 3] = so3.rotate(poses_cw[:, 3:7], gravity)

@@ -415,8 +415,8 @@ def upright_loop(seed: int, tilt: float) -> tuple[Tensor, Tensor, Tensor, Tensor
         chain.append(se3.compose(motion, chain[-1]))
     poses = torch.stack(chain)
     # Roll and pitch as gravity tells them: the heading and the place of the chain.
-    q = so3.multiply(true[:, 3:7], so3.multiply(so3.conjugate(true[:, 3:7]), poses[:, 3:7]) * true.new_tensor([0, 0, 1, 1]))
-    q = so3.normalise(q)
+    turn = so3.multiply(so3.conjugate(true[:, 3:7]), poses[:, 3:7]) * true.new_tensor([0, 0, 1, 1])
+    q = so3.normalise(so3.multiply(true[:, 3:7], turn))
     poses = torch.cat((-so3.rotate(q, se3.inverse(poses)[:, :3]), q), -1)
     variance = torch.cat((torch.full((3,), 0.02**2), torch.full((3,), 0.02**2 + tilt**2))).double()
     information = (1 / variance).expand(len(ii), 6) / sigma**2

@@ -248,6 +248,8 @@ def test_every_or_count_after_the_run(given, image_folder, tmp_path, capsys):
     for options, count in ((["--every", "3"], 4), (["--count", "5"], 5), (["--export-images", "source"], 11)):
         assert main(["export", str(out), str(tmp_path / options[0]), "--to", "colmap", *options]) == 0
         assert len(names(tmp_path / options[0] / "images")) == count
+    assert main(["export", str(out), str(tmp_path / "both"), "--to", "tum,colmap", "--every", "3"]) == 0
+    assert len(names(tmp_path / "both" / "colmap" / "images")) == 4 and names(tmp_path / "both" / "tum")
     capsys.readouterr()
     options = ["--to", "colmap", "--segment", "1"]
     assert main(["export", str(out), str(tmp_path / "new"), *options]) == 2

@@ -1,7 +1,8 @@
 """Second run over the beginning of a sequence, backward and with another seed, where the first one leaves doubt.
 
-Where the two differ a third one, forward and with a seed of its own, decides: what chance has found it rarely finds
-twice.
+Where the two differ and the second fits its measurements no better than the first, a third one, forward and with a
+seed of its own, decides: what chance has found it rarely finds twice. Against a second run that fits better nothing is
+decided: runs forward may share what misleads them.
 
 Images and masks alone are tracked: with measured depths there is no second solution, and no second run.
 
@@ -81,8 +82,8 @@ def compare_again(
 
     Returns:
         The quality with the difference. It is doubtful if the difference is large, unless the second run is good and
-        fits its measurements worse, or a third run agrees with the first; and if the second run finds no motion to
-        compare where the first one has.
+        fits its measurements worse, or fits them no better and a third run agrees with the first; and if the second
+        run finds no motion to compare where the first one has.
     """
     assert result.quality is not None
     mine = result.quality
@@ -103,9 +104,10 @@ def compare_again(
     worse = other is not None and other.verdict == "good" and other.residual > MAX_RESIDUAL_RATIO * mine.residual
     if worse or not difference > MAX_DIFFERENCE:  # NaN: nothing is known
         return replace(mine, second=difference)
-    third, stopped = _tracked(build(2), kept, should_stop)
-    if not stopped and _difference(third.trajectory, result.trajectory) <= MAX_DISPUTED:
-        return replace(mine, second=difference)
+    if other is None or not other.residual < mine.residual:
+        third, stopped = _tracked(build(2), kept, should_stop)
+        if not stopped and _difference(third.trajectory, result.trajectory) <= MAX_DISPUTED:
+            return replace(mine, second=difference)
     reason = f"a second run, backward with another seed, differs by {difference:.0f}% of the path"
     return replace(mine, second=difference, verdict="doubtful", reason=reason, remedy=FILM)
 

@@ -111,6 +111,15 @@ def test_a_third_run_decides_where_they_differ(third, verdict):
     assert quality.verdict == verdict and quality.second > 3 and not walks
 
 
+def test_a_second_run_that_fits_better_is_not_outvoted():
+    """Two runs forward may share what misleads them."""
+    for residual, verdict in ((0.28, "doubtful"), (0.3, "good"), (0.32, "good")):
+        first = replace(UNSURE, residual=0.3)
+        walks = {1: Walk(2.0, quality=replace(UNSURE, residual=residual)), 2: Walk(quality=first)}
+        quality = ran(walks.pop, first=first).result.quality
+        assert quality.verdict == verdict and quality.second > 3 and bool(walks) is (verdict == "doubtful")
+
+
 def test_frames_with_equal_times_are_an_error_of_the_library_or_none():
     """The first run ends before them; the second one meets them."""
     twice = frames(30)

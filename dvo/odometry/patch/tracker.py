@@ -47,6 +47,7 @@ from dvo.odometry.patch.initialisation import (
     leave_minimum,
     restart_due,
 )
+from dvo.odometry.patch.kernels import load_in_background
 from dvo.odometry.patch.loops import loop_closer
 from dvo.odometry.patch.new_recording import begin_in_map
 from dvo.odometry.patch.retry import retry_waiting
@@ -108,6 +109,8 @@ class PatchOdometry:
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
         self.archive = archive
+        if self.device.type == "cpu":
+            load_in_background()
         self.reset()
 
     def reset(self) -> None:

@@ -39,12 +39,19 @@ def compiled_meanwhile(arguments: argparse.Namespace) -> AbstractContextManager[
     if system is not None or device not in ("auto", "cpu") or os.environ.get("DVO_KERNELS") == "torch":
         return contextlib.nullcontext()
     file = done_file()
-    if file is None or file.exists() or available_cores() < 2:
-        return contextlib.nullcontext()
-    limit = memory_of_group(MEMBERSHIP, CGROUPS)
-    if limit is not None and limit < TRACKING.resident * 2**20 + _MEMORY:
+    if file is None or file.exists() or not room_beside(_MEMORY):
         return contextlib.nullcontext()
     return compiled_by([sys.executable, "-m", "dvo.commands.kernels"])
+
+
+def room_beside(memory: int) -> bool:
+    """Tell if there is a core, and memory, for another process beside one that tracks.
+
+    Args:
+        memory: of that process, bytes.
+    """
+    limit = memory_of_group(MEMBERSHIP, CGROUPS)
+    return available_cores() >= 2 and (limit is None or limit >= TRACKING.resident * 2**20 + memory)
 
 
 def done_file() -> Path | None:

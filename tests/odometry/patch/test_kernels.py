@@ -9,7 +9,7 @@ import sys
 import pytest
 
 LOAD = """
-import sys, threading
+import sys, threading, torch
 from importlib import import_module
 from dvo.odometry.patch import kernels
 names = {names}

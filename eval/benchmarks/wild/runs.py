@@ -6,7 +6,6 @@ import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from dvo.data.calibration.calibration import Calibration
 from dvo.data.frame import Frame
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory
-from dvo.odometry.protocol import Estimate
+from dvo.odometry.protocol import Estimate, Odometry
 from dvo.session import session
 from eval.systems.registry import find_system
 
@@ -129,8 +128,11 @@ def carry_out(task: Task) -> Run:
         if not first and estimate is not None and estimate.pose_wc is not None:
             first.append(number)
 
+    def build(number: int) -> Odometry:
+        return find_system(task.system).build(task.seed + number, "cpu")
+
     try:
-        system, source = find_system(task.system), task.video.open()
+        source = task.video.open()
         seconds: dict[str, float] = {}
         if task.video.calib is None:
             begun = time.process_time()
@@ -141,8 +143,7 @@ def carry_out(task: Task) -> Run:
         if task.backward:
             frames = reversed_frames(list(source))
         begun = time.process_time()
-        again = partial(system.build, task.seed + 1, "cpu")
-        done = session.run(system.build(task.seed, "cpu"), frames, on_frame=on_frame, again=again)
+        done = session.run(build(0), frames, on_frame=on_frame, again=build)
         seconds["tracking"] = time.process_time() - begun
     except DvoError as error:
         return Run(task.key, str(task.video), verdict="failed", error=str(error))

@@ -12,7 +12,7 @@ from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory
 from eval.benchmarks.wild.__main__ import judge, main, tasks_of
 from eval.benchmarks.wild.measures import Expected, Measures, backward, difference, measure, read_expected
-from eval.benchmarks.wild.runs import Run, Video
+from eval.benchmarks.wild.runs import Run, Task, Video, carry_out
 
 
 def path(positions, angles=0.0):
@@ -135,14 +135,49 @@ def test_lists_that_are_not_understood_are_refused(tmp_path, text, field):
         read_expected(file)
 
 
-@pytest.mark.slow
-def test_the_command_writes_table_and_page_and_goes_on(tmp_path, capsys):
-    out, rng = tmp_path / "out", np.random.default_rng(0)
-    writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))
+def noise_video(folder):
+    rng = np.random.default_rng(0)
+    writer = cv2.VideoWriter(str(folder / "clip.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))
     for _ in range(12):
         writer.write(rng.integers(0, 255, (48, 64, 3), np.uint8))
     writer.release()
-    (tmp_path / "clip.calib.txt").write_text("50 50 31.5 23.5\n")
+    (folder / "clip.calib.txt").write_text("50 50 31.5 23.5\n")
+
+
+UNSURE = """
+import numpy as np
+from dvo.data.trajectory import Trajectory
+from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
+from dvo.odometry.quality import Quality
+
+class Unsure:
+    name = "unsure"
+    def __init__(self, seed, device):
+        self.seed, self.times, self.numbers = seed, [], []
+    def track(self, frame):
+        self.times.append(frame.timestamp)
+        self.numbers.append(frame.index)
+        return Estimate(frame.timestamp, None, Status.TRACKING)
+    def finish(self):
+        t = np.array(self.numbers, float)
+        poses = np.column_stack([t, (self.seed - 3) * t**2, 0 * t, np.tile([0.0, 0, 0, 1], (len(t), 1))])
+        quality = Quality("good", tracked=1.0, agreement=1.0, deviation=0.05, check=1.0, checks=9)
+        return Result(Trajectory(np.array(self.times), poses), SparseMap(), len(t), 0, quality=quality)
+"""
+
+
+def test_a_run_that_leaves_doubt_is_compared_with_one_of_the_next_seed(tmp_path):
+    noise_video(tmp_path)
+    (tmp_path / "unsure.py").write_text(UNSURE)
+    video = Video("clip", tmp_path / "clip.avi", tmp_path / "clip.calib.txt")
+    run = carry_out(Task(video, f"{tmp_path / 'unsure.py'}:Unsure", seed=3))
+    assert (run.error, run.verdict) == ("", "doubtful"), "the second run, of seed 4, is bent"
+
+
+@pytest.mark.slow
+def test_the_command_writes_table_and_page_and_goes_on(tmp_path, capsys):
+    out = tmp_path / "out"
+    noise_video(tmp_path)
     (tmp_path / "right.yaml").write_text("clip: {video: clip.avi, must: good, straightness: [0.9, 1], seeds: 1}\n")
     command = [str(tmp_path), "--systems", "null", "--seeds", "2", "--out", str(out)]
     main([*command, "--expected", str(tmp_path / "right.yaml")])

@@ -113,9 +113,12 @@ def build_parser() -> argparse.ArgumentParser:
 
     export = commands.add_parser("export", help="write a results folder or a map for another program")
     export.add_argument("source", metavar="SOURCE", help="results folder of dvo run or dvo demo, or map file (.dvo)")
-    export.add_argument("out", metavar="OUT", help="new folder")
+    export.add_argument("out", metavar="OUT", help="new folder; of several formats, one in it for each")
     export.add_argument(
-        "--to", metavar="NAME", required=True, help="format: tum, kitti, euroc, colmap, colmap-text or nerfstudio"
+        "--to",
+        metavar="NAMES",
+        required=True,
+        help="tum, kitti, euroc, colmap, colmap-text or nerfstudio; several apart by commas",
     )
     export.add_argument("--segment", type=_count, metavar="N", help="number of the segment (default: the longest)")
     add_image_options(export)

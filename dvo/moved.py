@@ -32,13 +32,14 @@ MOVED = {
     "dvo.odometry.evidence": f"{_FRAMES}.content",
     "dvo.odometry.frame_sequence": f"{_FRAMES}.gate",
     "dvo.odometry.frames.frame_sequence": f"{_FRAMES}.gate",
+    "dvo.odometry.frames.working_image": f"{_FRAMES}.gate",
     "dvo.odometry.observer": f"{_SESSION}.observer",
     "dvo.odometry.place_descriptors": "dvo.odometry.loops.place_descriptors",
     "dvo.odometry.results": f"{_SESSION}.results",
     "dvo.odometry.scale_options": "dvo.odometry.depth.scale_options",
     "dvo.odometry.session": f"{_SESSION}.session",
     "dvo.odometry.tracker": "dvo.odometry.patch.tracker",
-    "dvo.odometry.working_image": f"{_FRAMES}.working_image",
+    "dvo.odometry.working_image": f"{_FRAMES}.gate",
 }
 """Old name to new name."""
 

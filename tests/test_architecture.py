@@ -35,8 +35,8 @@ ARROWS: dict[str, set[str]] = {
 # Inside of these two a room, or a file between rooms, may import those that stand before it.
 FLOORS: dict[str, tuple[str, ...]] = {
     "data": (
-        "files", "images", "interval", "inertial", "frame", "positions", "trajectory", "extrinsics", "calibration",
-        "inertial_files", "sensors", "recording", "mask", "frame_checks", "readers", "opening", "source", "companions",
+        "files", "images", "interval", "inertial", "frame", "frame_checks", "positions", "trajectory", "extrinsics",
+        "calibration", "inertial_files", "sensors", "recording", "mask", "readers", "opening", "source", "companions",
         "streams", "open",
     ),
     "odometry": (

@@ -93,6 +93,14 @@ def test_export_of_a_results_folder(results, tmp_path, capsys):
     assert len(first) == 7
 
 
+def test_export_to_several_formats(results, tmp_path, capsys):
+    out = tmp_path / "both"
+    assert main(["export", str(results), str(out), "--to", "kitti,tum"]) == 0
+    assert names(out) == ["kitti", "tum"] and all(any((out / name).iterdir()) for name in names(out))
+    assert main(["export", str(results), str(tmp_path / "none"), "--to", "kitti,nothing"]) == 2
+    assert "'nothing'" in capsys.readouterr().err and not (tmp_path / "none").exists()
+
+
 def test_the_only_segment_has_the_number_0(given, image_folder, tmp_path):
     given()
     assert main(arguments(image_folder, tmp_path / "out")) == 0
@@ -240,6 +248,8 @@ def test_every_or_count_after_the_run(given, image_folder, tmp_path, capsys):
     for options, count in ((["--every", "3"], 4), (["--count", "5"], 5), (["--export-images", "source"], 11)):
         assert main(["export", str(out), str(tmp_path / options[0]), "--to", "colmap", *options]) == 0
         assert len(names(tmp_path / options[0] / "images")) == count
+    assert main(["export", str(out), str(tmp_path / "both"), "--to", "tum,colmap", "--every", "3"]) == 0
+    assert len(names(tmp_path / "both" / "colmap" / "images")) == 4 and names(tmp_path / "both" / "tum")
     capsys.readouterr()
     options = ["--to", "colmap", "--segment", "1"]
     assert main(["export", str(out), str(tmp_path / "new"), *options]) == 2

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.edges import free_slots
 from dvo.ba.limits import LARGEST, LARGEST_TURN, SHORTEST_FOCAL
 from dvo.ba.problem import StateBlock
+from dvo.core.errors import DvoError
+from dvo.core.settings import shown
 from dvo.geometry import se3, sim3, so3
 
 POSES, INVERSE_DEPTHS, INTRINSICS = "poses", "inverse_depths", "intrinsics"
@@ -190,3 +193,39 @@ def _retract_intrinsics(intrinsics: Tensor, step: Tensor) -> Tensor:
     focal, centre = intrinsics.split(2, -1)
     grown = (focal * step[..., :2].exp()).clamp(SHORTEST_FOCAL, LARGEST)
     return torch.cat((grown, centre if step.shape[-1] == 1 else centre + focal * step[..., 2:]), -1)
+
+
+def free_slots(fixed: int | Tensor | Sequence[bool], frames: int, device: torch.device) -> tuple[Tensor, int]:
+    """Row of each frame among the free ones ``(N,)``, and their number ``n``; fixed frames share the row ``n``.
+
+    Args:
+        fixed: number of leading frames that stay, or which: bool ``(N,)``.
+        frames: number of frames ``N``.
+        device: of the result.
+
+    Raises:
+        DvoError: a number that is negative or greater than that of the frames, or no mask of all frames.
+    """
+    if isinstance(fixed, Integral) and not isinstance(fixed, bool):
+        leading = int(fixed)
+        if not 0 <= leading <= frames:
+            raise DvoError(f"is {leading}, of {frames} frames", field="fixed", remedy=f"give 0 to {frames}")
+        free = frames - leading
+        slot = torch.arange(frames, device=device) - leading
+        return torch.where(slot < 0, free, slot), free
+    stays = _mask(fixed, frames).to(device)
+    free = int((~stays).sum())
+    return torch.where(stays, free, (~stays).cumsum(0) - 1), free
+
+
+def _mask(fixed: object, frames: int) -> Tensor:
+    """A mask of all frames, or DvoError. Numbers are no mask: they could be meant as indices."""
+    if isinstance(fixed, Sequence) and all(isinstance(x, (bool, np.bool_)) for x in fixed):
+        fixed = torch.tensor(fixed, dtype=torch.bool)
+    if isinstance(fixed, np.ndarray) and fixed.dtype == bool:
+        fixed = torch.from_numpy(fixed)
+    if isinstance(fixed, Tensor) and fixed.dtype == torch.bool and fixed.shape == (frames,):
+        return fixed
+    found = f"{fixed.dtype} of shape {tuple(fixed.shape)}" if isinstance(fixed, Tensor) else shown(fixed)
+    what = f"is {found}, neither a number of frames nor a mask of {frames}"
+    raise DvoError(what, field="fixed", remedy=f"give a whole number, or bool ({frames},)")

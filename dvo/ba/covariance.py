@@ -14,9 +14,9 @@ from dvo.ba.layer.schur import SchurFactor
 from dvo.ba.layer.step import normal_equations, reduced_system
 from dvo.ba.options import BADamping
 from dvo.ba.problem import NormalEquations, Problem
+from dvo.core.context import full_precision
 from dvo.core.errors import DvoError
 from dvo.geometry import se3
-from dvo.geometry.precision import full_precision
 
 
 @torch.no_grad()

@@ -7,16 +7,12 @@ filled up with empty places: then a sum over edges is a matrix product, and noth
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Integral
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from dvo.core.errors import DvoError
-from dvo.core.settings import shown
 
 CHUNK = 1 << 17
 """Places linearised at a time: bounds the memory when every pixel of a feature map is a patch."""
@@ -113,39 +109,3 @@ def plan_edges(ii: Tensor, jj: Tensor, kk: Tensor, frames: int, patches: int) ->
     numbers = edge_numbers(ii, jj, kk, frames, patches)
     pair_i, pair_j = torch.div(pairs, frames, rounding_mode="floor"), pairs % frames
     return EdgePlan(frames, patches, pair_i, pair_j, group_pair, order, filled, kk[order], numbers)
-
-
-def free_slots(fixed: int | Tensor | Sequence[bool], frames: int, device: torch.device) -> tuple[Tensor, int]:
-    """Row of each frame among the free ones ``(N,)``, and their number ``n``; fixed frames share the row ``n``.
-
-    Args:
-        fixed: number of leading frames that stay, or which: bool ``(N,)``.
-        frames: number of frames ``N``.
-        device: of the result.
-
-    Raises:
-        DvoError: a number that is negative or greater than that of the frames, or no mask of all frames.
-    """
-    if isinstance(fixed, Integral) and not isinstance(fixed, bool):
-        leading = int(fixed)
-        if not 0 <= leading <= frames:
-            raise DvoError(f"is {leading}, of {frames} frames", field="fixed", remedy=f"give 0 to {frames}")
-        free = frames - leading
-        slot = torch.arange(frames, device=device) - leading
-        return torch.where(slot < 0, free, slot), free
-    stays = _mask(fixed, frames).to(device)
-    free = int((~stays).sum())
-    return torch.where(stays, free, (~stays).cumsum(0) - 1), free
-
-
-def _mask(fixed: object, frames: int) -> Tensor:
-    """A mask of all frames, or DvoError. Numbers are no mask: they could be meant as indices."""
-    if isinstance(fixed, Sequence) and all(isinstance(x, (bool, np.bool_)) for x in fixed):
-        fixed = torch.tensor(fixed, dtype=torch.bool)
-    if isinstance(fixed, np.ndarray) and fixed.dtype == bool:
-        fixed = torch.from_numpy(fixed)
-    if isinstance(fixed, Tensor) and fixed.dtype == torch.bool and fixed.shape == (frames,):
-        return fixed
-    found = f"{fixed.dtype} of shape {tuple(fixed.shape)}" if isinstance(fixed, Tensor) else shown(fixed)
-    what = f"is {found}, neither a number of frames nor a mask of {frames}"
-    raise DvoError(what, field="fixed", remedy=f"give a whole number, or bool ({frames},)")

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from dvo.ba.limits import check_positive
+from dvo.ba.checks import check_positive
 from dvo.core.errors import DvoError
 from dvo.core.settings import shown
 

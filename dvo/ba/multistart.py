@@ -21,9 +21,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from dvo.ba.cold_start import damping_at
 from dvo.ba.kernels import Kernel
-from dvo.ba.options import BAOptions
+from dvo.ba.options import BAOptions, damping_at
 from dvo.ba.patch_problem import KERNEL, MAX_RESIDUAL, PatchProblem
 from dvo.ba.solve import solve
 from dvo.ba.sparse.global_adjust import GlobalBAOptions

@@ -16,7 +16,7 @@ from dvo.core.settings import check_settings
 from dvo.data.calibration.calibration import Calibration
 from dvo.data.files.output import replaced
 from dvo.data.frame import Frame
-from dvo.geometry.undistort import Undistorter, needs_undistortion
+from dvo.geometry.undistort import Undistorter
 
 _CELLS = (8, 6)  # columns and rows of the cells of the coverage
 _TILT = "tilt the board by 30 to 45 degrees to the left, right, up and down, and show it near and in all corners"
@@ -272,7 +272,7 @@ def _doubts(found: BoardCalibration, relative: float, options: BoardOptions) -> 
         )
     try:
         camera = found.calibration.camera(found.width, found.height)
-        if needs_undistortion(camera):
+        if camera.needs_undistortion:
             Undistorter(camera)
     except DvoError as error:
         doubts.append(

@@ -56,11 +56,21 @@ def export(arguments: argparse.Namespace) -> int:
         DvoError: no results folder or map, no such format or segment, options of images that do not fit, a source that
             is not there any more, or a folder that is not empty.
     """
-    folder, name = Path(arguments.source), arguments.to
     check_empty(Path(arguments.out))  # before images are read
+    names = list(dict.fromkeys(name.strip() for name in arguments.to.split(",")))
+    check_formats(names, option="--to")
     if arguments.every is not None or arguments.count is not None:
         arguments.export_images = arguments.export_images or SOURCE
-    check_image_options(arguments, [name], "--to")
+    check_image_options(arguments, names, "--to")
+    folders = [arguments.out] if len(names) == 1 else [str(Path(arguments.out) / name) for name in names]
+    for name, out in zip(names, folders, strict=True):
+        _export(argparse.Namespace(**{**vars(arguments), "to": name, "out": out}))
+    return 0
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    """To one format."""
+    folder, name = Path(arguments.source), arguments.to
     if folder.is_file():
         if arguments.export_images == SOURCE:
             message, remedy = "a map file does not know its source", "give the results folder of the run"
@@ -72,14 +82,12 @@ def export(arguments: argparse.Namespace) -> int:
         )
     if name in MAP_FORMATS and name not in TRAJECTORY_FORMATS:
         return _export_recorded(folder, arguments, image_choice(arguments))
-    check_formats([name], option="--to")  # before any file is read
     file = _trajectory_file(folder, arguments.segment)
     if not file.is_file():
         raise DvoError("not a results folder", file=folder, remedy="give a folder that dvo run has written")
     trajectory = read_tum(file)
     export_trajectory(trajectory, arguments.out, name)
     say(f"exported to {arguments.out}: {describe_rows(name, len(trajectory), _frames_read(folder))}")
-    return 0
 
 
 def check_image_options(
@@ -200,7 +208,7 @@ def _describe(found: Reconstruction, others: Sequence[int]) -> str:
     return text
 
 
-def _export_recorded(folder: Path, arguments: argparse.Namespace, choice: ImageChoice) -> int:
+def _export_recorded(folder: Path, arguments: argparse.Namespace, choice: ImageChoice) -> None:
     """Write a map of a results folder: of the map file that the run has saved, or of the images of its source."""
     out, name, segment = Path(arguments.out), arguments.to, arguments.segment
     stored = read_results(folder)
@@ -215,7 +223,6 @@ def _export_recorded(folder: Path, arguments: argparse.Namespace, choice: ImageC
     source = _reopened(folder, stored.facts)
     for sentence in export_images(source, stored.result, stored.rows, graph, {name: out}, choice, segment):
         say(f"exported to {out}: {sentence.removeprefix(f'{name}: ')}")
-    return 0
 
 
 def _reopened(folder: Path, facts: dict[str, Any]) -> Source:
@@ -244,9 +251,8 @@ def _reopened(folder: Path, facts: dict[str, Any]) -> Source:
     return open_source(source, calib=calib, times=path("times"), mask=path("mask"), guess=True, **more)
 
 
-def _export_map_file(file: Path, out: str, name: str, segment: int | None) -> int:
+def _export_map_file(file: Path, out: str, name: str, segment: int | None) -> None:
     """Write the last recording of a map file: a segment, or the world with the most poses."""
-    check_formats([name], option="--to")
     graph = load_graph(file)
     result, main = result_of_log(graph.log, {}, None, graph.worlds, graph.recording)
     if segment is not None and segment >= len(result.segments):
@@ -254,11 +260,10 @@ def _export_map_file(file: Path, out: str, name: str, segment: int | None) -> in
     if name in MAP_FORMATS:
         chosen = graph.recording.segment + (main if segment is None else segment)
         say(f"exported to {out}: {export_graph(graph, chosen, name, out)}")
-        return 0
+        return
     trajectory = result.trajectory if segment is None else result.segments[segment].trajectory
     export_trajectory(trajectory, out, name)
     say(f"exported to {out}: {describe_rows(name, len(trajectory), result.frames_read)}")
-    return 0
 
 
 def _trajectory_file(folder: Path, segment: int | None) -> Path:

@@ -1,4 +1,4 @@
-"""Own settings of torch and NumPy in place of those of the calling program."""
+"""Settings of torch and NumPy in a context: own ones in place of those of the calling program, and full precision."""
 
 from __future__ import annotations
 
@@ -58,3 +58,29 @@ def in_own_context(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **keywords)
 
     return call
+
+
+@contextlib.contextmanager
+def full_precision(device: torch.device) -> Iterator[None]:
+    """Compute geometry without autocast and without TF32 matrix products, whatever the networks around it run in.
+
+    Ten bits of mantissa resolve a coordinate of 1000 pixels to one pixel only.
+
+    Args:
+        device: on which the computation runs.
+    """
+    matmul = torch.backends.cuda.matmul
+    name, exact = ("fp32_precision", "ieee") if hasattr(matmul, "fp32_precision") else ("allow_tf32", False)
+    before = getattr(matmul, name)
+    change = device.type == "cuda" and before != exact
+    if change:
+        setattr(matmul, name, exact)
+    try:
+        if torch.is_autocast_enabled(device.type):
+            with torch.autocast(device.type, enabled=False):
+                yield
+        else:
+            yield
+    finally:
+        if change:
+            setattr(matmul, name, before)

@@ -1,4 +1,4 @@
-"""Checks of the frames that enter an odometry, and harmless conversions of their images."""
+"""Checks of the frames that enter an odometry, and harmless conversions of their images and masks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
-from dvo.data.mask import checked_mask
 from dvo.geometry.camera import Camera
 
 _CHANNELS = (1, 3, 4)
@@ -99,6 +98,31 @@ def checked_image(image: Any, camera: Any, name: str) -> np.ndarray:
     pixels = _with_channels(_array_of(image, f"{name}: image"), f"{name}: image")
     _check_camera(camera, pixels, name)  # before the conversion, which needs memory for all pixels
     return _rgb8(pixels, f"{name}: image")
+
+
+def checked_mask(mask: Any, height: int, width: int, field: str) -> np.ndarray | None:
+    """Check the mask of a frame.
+
+    Args:
+        mask: ``(H, W)`` bool or uint8, 0 for pixels to ignore; None for none.
+        height, width: of the image.
+        field: for messages.
+
+    Returns:
+        ``(H, W)`` bool, True for pixels to use.
+
+    Raises:
+        DvoError: another type or size.
+    """
+    if mask is None:
+        return None
+    if not isinstance(mask, np.ndarray) or mask.dtype not in (np.bool_, np.uint8):
+        kind = f"an array of {mask.dtype}" if isinstance(mask, np.ndarray) else _kind(mask)
+        raise DvoError(f"expected a bool or uint8 array, got {kind}", field=field, remedy="give (H, W), 0: ignore")
+    if mask.shape != (height, width):
+        message = f"has the shape {mask.shape}, the image ({height}, {width})"
+        raise DvoError(message, field=field, remedy="give a mask of the size of the image")
+    return mask if mask.dtype == np.bool_ else mask != 0
 
 
 def _name(index: Any) -> str:

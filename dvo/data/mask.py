@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,33 +15,6 @@ from dvo.geometry.undistort import Undistorter
 
 _HALF = 128  # grey level from which a pixel of a JPEG file is white: its black is not exactly 0
 _REMEDY = "give an image of the size of the recorded ones, white where they are used and black elsewhere"
-
-
-def checked_mask(mask: Any, height: int, width: int, field: str) -> np.ndarray | None:
-    """Check the mask of a frame.
-
-    Args:
-        mask: ``(H, W)`` bool or uint8, 0 for pixels to ignore; None for none.
-        height, width: of the image.
-        field: for messages.
-
-    Returns:
-        ``(H, W)`` bool, True for pixels to use.
-
-    Raises:
-        DvoError: another type or size.
-    """
-    if mask is None:
-        return None
-    if not isinstance(mask, np.ndarray) or mask.dtype not in (np.bool_, np.uint8):
-        kind = (
-            f"an array of {mask.dtype}" if isinstance(mask, np.ndarray) else f"an object of type {type(mask).__name__}"
-        )
-        raise DvoError(f"expected a bool or uint8 array, got {kind}", field=field, remedy="give (H, W), 0: ignore")
-    if mask.shape != (height, width):
-        message = f"has the shape {mask.shape}, the image ({height}, {width})"
-        raise DvoError(message, field=field, remedy="give a mask of the size of the image")
-    return mask if mask.dtype == np.bool_ else mask != 0
 
 
 def read_mask(file: Path, invert: bool = False) -> np.ndarray:

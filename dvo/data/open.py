@@ -16,6 +16,7 @@ from dvo.data.calibration.read import read_calibration
 from dvo.data.companions.inertial_source import AUTO, NONE, choose_inertial, imu_calibration_of
 from dvo.data.files.files import lookups
 from dvo.data.files.stamps import checked_rate
+from dvo.data.images.fields import INTERLACED, are_interlaced
 from dvo.data.images.halves import two_views
 from dvo.data.images.reduction import MAX_PIXELS, reduction_to
 from dvo.data.inertial_files.imu_calibration import ImuCalibration
@@ -25,7 +26,7 @@ from dvo.data.opening import check_invert, check_stride, first_frame, locate, no
 from dvo.data.readers.groundtruth import read_groundtruth
 from dvo.data.readers.registry import find_reader
 from dvo.data.readers.rosbag import split_topic
-from dvo.data.recording import Recording, Request, Selection
+from dvo.data.recording import Log, Recording, Request, Selection
 from dvo.data.source import Reading, Source
 from dvo.data.streams.capture import is_stream, not_found_remedy
 from dvo.data.streams.live_source import open_stream
@@ -166,6 +167,8 @@ def open_source(
             f"the halves of the images look alike, {halves}: if this is stereo, track one of them "
             f"(ffmpeg -vf crop={part})"
         )
+    if recording.kind == "folder" and are_interlaced(raw.image for raw in recording.frames(Log())):
+        doubts.append(INTERLACED)
     reduction = reduction_to(max_pixels, width, height)
     size, masks = (width, height), None
     if mask is not None:

@@ -24,7 +24,7 @@ from dvo.data.sensors.depth import registered_depth, resized_depth
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
 from dvo.geometry.field_of_view import notice_of_cut
-from dvo.geometry.undistort import Undistorter, needs_undistortion
+from dvo.geometry.undistort import Undistorter
 
 
 class Stage(Protocol):
@@ -116,7 +116,7 @@ class Source:
         self.calibration, self.guess, self.masks = reading.calibration, reading.guess, reading.masks
         self.stride, self.reduction = reading.selection.stride, reading.selection.reduction
         read = self.recorded_camera if self.reduction is None else self.reduction.camera(self.recorded_camera)
-        self._undistorter = Undistorter(read) if reading.undistort and needs_undistortion(read) else None
+        self._undistorter = Undistorter(read) if reading.undistort and read.needs_undistortion else None
         self._right_undistorter: Undistorter | None = None  # the size of right images is not known before the first
         self.camera = self._undistorter.camera if self._undistorter else read
         self._cut = notice_of_cut(read, self.camera) if self._undistorter else []
@@ -263,7 +263,7 @@ class Source:
         camera = rig.calibration.camera(image.shape[1], image.shape[0])
         if self.reduction is not None and image.shape[1::-1] == self.reduction.recorded:
             image, camera = self.reduction(image), self.reduction.camera(camera)
-        if self.reading.undistort and needs_undistortion(camera):
+        if self.reading.undistort and camera.needs_undistortion:
             if self._right_undistorter is None or self._right_undistorter.source != camera:
                 self._right_undistorter = Undistorter(camera)
             image, camera = self._right_undistorter(image), self._right_undistorter.camera

@@ -91,12 +91,16 @@ class Camera:
 
     @property
     def is_distorted(self) -> bool:
-        """True if any distortion coefficient differs from 0.
-
-        Use :func:`dvo.geometry.undistort.needs_undistortion` to decide about images: a fisheye without coefficients is
-        no pinhole camera.
-        """
+        """True if any distortion coefficient differs from 0; :attr:`needs_undistortion` decides about images."""
         return self.model != "none" and any(c != 0 for c in self.coefficients)
+
+    @property
+    def needs_undistortion(self) -> bool:
+        """True if images of the camera differ from those of a pinhole camera.
+
+        A fisheye with zero coefficients needs undistortion too: its model maps the angle, not its tangent.
+        """
+        return self.model not in ("none", "radtan") or self.is_distorted
 
     def resized(self, width: int, height: int) -> Camera:
         """Camera of the same image resampled to another size: ``f' = f s``, ``c' = (c + .5) s - .5``.

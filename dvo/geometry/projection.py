@@ -16,11 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.core.context import full_precision
 from dvo.core.errors import DvoError
 from dvo.core.kernels import is_batched, use_kernels
 from dvo.geometry import se3, so3
 from dvo.geometry.bounds import MIN_Z_DIVISION, MIN_Z_VALID
-from dvo.geometry.precision import full_precision
 
 
 @dataclass(frozen=True)

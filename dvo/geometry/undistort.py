@@ -25,17 +25,6 @@ from dvo.geometry.lenses import (
 _FAR_OFF = -1e4  # pixels, outside of every image
 
 
-def needs_undistortion(camera: Camera) -> bool:
-    """True if images of the camera differ from those of a pinhole camera.
-
-    A fisheye with zero coefficients needs undistortion too: its model maps the angle, not its tangent.
-
-    Args:
-        camera: with its model and coefficients.
-    """
-    return camera.model not in ("none", "radtan") or camera.is_distorted
-
-
 def distort(points: np.ndarray, camera: Camera) -> np.ndarray:
     """Apply the lens model.
 
@@ -47,7 +36,7 @@ def distort(points: np.ndarray, camera: Camera) -> np.ndarray:
         ``(..., 2)`` float64 distorted normalised coordinates; a pixel is ``(fx x + cx, fy y + cy)`` of them.
     """
     points = np.asarray(points, dtype=np.float64)
-    if not needs_undistortion(camera):
+    if not camera.needs_undistortion:
         return points.copy()
     return distort_plane(points, camera.model, camera.coefficients)
 
@@ -65,7 +54,7 @@ def undistort(points: np.ndarray, camera: Camera, iterations: int = 20) -> np.nd
         range: beyond the radius at which it folds back, or at 90 degrees and more of a fisheye).
     """
     points = np.asarray(points, dtype=np.float64)
-    if not needs_undistortion(camera):
+    if not camera.needs_undistortion:
         return points.copy()
     return undistort_plane(points, camera.model, camera.coefficients, iterations)
 
@@ -167,7 +156,7 @@ def undistorted_camera(camera: Camera) -> Camera:
     Raises:
         DvoError: at twice the focal length the lens model still folds the image over itself or leaves it.
     """
-    if not needs_undistortion(camera):
+    if not camera.needs_undistortion:
         return _scaled(camera, 1.0)
     pinhole = _widest(camera)
     if camera.readout > 0:
@@ -252,7 +241,7 @@ class Undistorter:
             ValueError: an image of another size than that of ``source``.
         """
         self._check(image)
-        if not needs_undistortion(self.source):
+        if not self.source.needs_undistortion:
             return image
         import cv2
 
@@ -274,7 +263,7 @@ class Undistorter:
             ValueError: an image of another size than that of ``source``.
         """
         self._check(depth)
-        if not needs_undistortion(self.source):
+        if not self.source.needs_undistortion:
             return depth
         import cv2
 

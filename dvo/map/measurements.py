@@ -100,7 +100,7 @@ class PackedEdges:
         """Copy with another array.
 
         Args:
-            keep: copies an array, such as :meth:`dvo.map.storage.ArrayStorage.keep`.
+            keep: copies an array, such as :meth:`dvo.map.archive.ArrayStorage.keep`.
         """
         return PackedEdges(keep(self.data), self.pairs, self.edges)
 

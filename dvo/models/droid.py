@@ -14,8 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dvo.ba.cold_start import COLD_UPDATES
-from dvo.ba.options import BADamping
+from dvo.ba.options import COLD_UPDATES, BADamping
 from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.models.dense_step import DAMPING, DenseMode, DenseOptions, DenseState, FrameGraph, dense_step, frame_graph
@@ -57,7 +56,7 @@ def neighbour_edges(frames: int, reach: int) -> tuple[Tensor, Tensor]:
 
 
 def damping_of(update: int) -> BADamping:
-    """Damping of the given update of a new graph, see :mod:`dvo.ba.cold_start`.
+    """Damping of the given update of a new graph, see :func:`dvo.ba.options.damping_at`.
 
     Args:
         update: number, from 0.

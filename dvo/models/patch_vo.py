@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from dvo.ba.cold_start import damping_at
+from dvo.ba.options import damping_at
 from dvo.geometry import se3
 from dvo.map.edges import PatchGraph
 from dvo.models.schedule import Stage, to_device, training_schedule

@@ -25,7 +25,7 @@ from dvo.data.frame_checks import checked_frame
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import sim3
 from dvo.geometry.alignment import align
-from dvo.odometry.frames.working_image import working_image
+from dvo.odometry.frames.gate import working_image
 from dvo.odometry.protocol import Odometry, Result
 from dvo.odometry.quality import FILM, Quality, leaves_doubt
 

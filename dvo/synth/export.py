@@ -16,7 +16,6 @@ from dvo.data.inertial import NOISE_PRESETS, ImuNoise
 from dvo.data.trajectory import Trajectory, write_tum
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import NED_FROM_CAMERA, invert_rodrigues, pose_matrices, poses_from_matrices, split
-from dvo.geometry.undistort import needs_undistortion
 from dvo.synth import salts
 from dvo.synth.euroc_tables import check_lens, nanoseconds, write_tables
 from dvo.synth.meshes.mesh import MeshScene
@@ -118,7 +117,7 @@ def export_sequence(
         raise DvoError(f"no layout {layout!r}", field="layout", remedy="choose tum, tartanair or euroc")
     if layout == "euroc":
         check_lens(sequence.camera)
-    if layout == "tartanair" and needs_undistortion(sequence.camera):
+    if layout == "tartanair" and sequence.camera.needs_undistortion:
         raise DvoError("TartanAir's layout has no lens distortion", field="layout", remedy="choose tum")
     out = Path(out)
     try:

@@ -38,9 +38,9 @@ from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
 from dvo.odometry.load import load
 from dvo.odometry.patch.tracker import PatchOdometry
-from dvo.odometry.uncertainty.displacement import TOLERANCE, window_metric
+from dvo.odometry.uncertainty.displacement import TOLERANCE
 from dvo.odometry.uncertainty.gauge import relative_error, window_gauge
-from dvo.odometry.uncertainty.measurements import WindowMeasurements
+from dvo.odometry.uncertainty.uncertainty import WindowMeasurements, window_metric
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from eval.benchmarks.weight_calibration import rendered_sequences
 

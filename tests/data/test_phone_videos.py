@@ -2,10 +2,12 @@
 
 import subprocess
 
+import cv2
 import imageio_ffmpeg
 import numpy as np
 import pytest
 
+from dvo.core.errors import DvoError
 from dvo.data import Calibration, open_source
 
 WIDTH, HEIGHT, COUNT, FPS = 160, 120, 12, 20
@@ -215,3 +217,31 @@ def test_two_views_in_one_video(tmp_path, stack, words):
            "-crf", 10, "-pix_fmt", "yuv420p", file, data=b"".join(image.tobytes() for image in pictures))  # fmt: skip
     assert words in " ".join(open_source(file, guess=True).warnings)
     assert not any("look alike" in text for text in open_source(encode(tmp_path / "a.mp4"), guess=True).warnings)
+
+
+@pytest.mark.parametrize("top_first", [True, False])
+@pytest.mark.parametrize("flagged", [True, False])
+def test_interlaced_videos_are_said(tmp_path, top_first, flagged):
+    """Some versions of OpenCV do not convert frames that the codec marks as interlaced, and return what they like."""
+    texture = np.random.default_rng(1).integers(0, 256, (HEIGHT // 8, WIDTH // 4, 3), dtype=np.uint8)
+    texture = texture.repeat(8, 0).repeat(8, 1)
+    moments = [texture[:, 3 * index : 3 * index + WIDTH].copy() for index in range(24)]
+    for first, second in zip(moments[::2], moments[1::2], strict=True):
+        first[int(top_first) :: 2] = second[int(top_first) :: 2]
+    fields = ("-flags", "+ildct+ilme", "-vf", f"setfield={'tff' if top_first else 'bff'}") if flagged else ()
+    file = encode(tmp_path / "camcorder.mp4", *fields, *FORMS["h264.mp4"], pictures=moments[::2])
+    try:
+        warnings = " ".join(open_source(file, calib=CALIB).warnings)
+    except DvoError as error:
+        assert flagged and "interlaced" in str(error) and "bwdif" in str(error)
+    else:
+        assert "interlaced" in warnings and "bwdif" in warnings
+
+
+def test_pictures_of_an_interlaced_video_are_said(tmp_path):
+    for index in range(8):
+        still = np.random.default_rng(1).integers(0, 256, (15, 60), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
+        image = still[:, 6 * index : 6 * index + WIDTH].copy()
+        image[1::2] = still[1::2, 6 * index + 3 : 6 * index + 3 + WIDTH]
+        assert cv2.imwrite(str(tmp_path / f"{index}.png"), image)
+    assert "bwdif" in " ".join(open_source(tmp_path, calib=CALIB, fps=25).warnings)

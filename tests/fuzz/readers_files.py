@@ -19,7 +19,7 @@ from dvo.data.readers.groundtruth import read_groundtruth
 from dvo.data.streams.streams import stream
 from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
 from dvo.geometry.camera import Camera
-from dvo.geometry.undistort import Undistorter, needs_undistortion
+from dvo.geometry.undistort import Undistorter
 from tests.fuzz.readers_data import HEIGHT, MODULES, WIDTH, K, images, lines, picture, poses
 from tests.fuzz.target import Target, check_frames, check_times, check_trajectory, require
 
@@ -86,7 +86,7 @@ def _calibration(folder: Path, random: np.random.Generator | None, name: str) ->
     calibration = read_calibration(folder / name)
     camera = calibration.camera(WIDTH, HEIGHT)
     calibration.doubts(WIDTH, HEIGHT)
-    if needs_undistortion(camera):
+    if camera.needs_undistortion:
         undistorter = Undistorter(camera)
         require(np.isfinite(undistorter.camera.intrinsics).all(), "undistorted camera that is not finite")
         require(0 <= undistorter.camera.readout <= 1, "readout of the undistorted camera")

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
-from dvo.geometry.undistort import Undistorter, distort, needs_undistortion, undistort, undistorted_camera
+from dvo.geometry.undistort import Undistorter, distort, undistort, undistorted_camera
 
 # real lenses: TUM RGB-D freiburg1, EuRoC cam0, TUM-VI cam0
 FR1 = Camera(517.3, 516.5, 318.6, 255.3, 640, 480, "radtan", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
@@ -71,7 +71,7 @@ def test_points_that_no_ray_reaches_are_nan():
 
 def test_fisheye_without_coefficients_needs_undistortion():
     camera = Camera(190, 190, 255, 255, 512, 512, "fisheye")
-    assert needs_undistortion(camera)
+    assert camera.needs_undistortion
     assert distort(np.array([1.0, 0.0]), camera) == pytest.approx([np.pi / 4, 0])
     assert Undistorter(camera).camera.model == "none"
 

@@ -1,5 +1,7 @@
 """Archive of a keyframe graph: its memory bound, its measurements, and global bundle adjustment from it."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -7,12 +9,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from dvo.ba.sparse.global_adjust import GlobalBAOptions, global_bundle_adjust
 from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
-from dvo.map.archive import Archive, ArchiveConfig, ArchivedKeyframe
+from dvo.map.archive import Archive, ArchiveConfig, ArchivedKeyframe, ArrayStorage
 from dvo.map.features import FeatureCache
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.measurements import ArchivedEdges, pack_edges
@@ -20,6 +23,8 @@ from dvo.map.window import Keyframe
 from dvo.nets.patch.patchifier import patch_coordinates
 
 M = 3
+KINDS = st.sampled_from([np.uint8, np.int16, np.float16, np.float32, np.float64])
+ARRAYS = KINDS.flatmap(lambda kind: hnp.arrays(kind, hnp.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=9)))
 
 
 def keyframe(identifier, size=1000, anchor=None):
@@ -232,3 +237,39 @@ def test_frames_carried_by_a_lost_keyframe_are_lost_with_it():
     assert [record.lost for record in graph.log.frames] == [True, True, False, False, False, False]
     assert [frame.identifier for frame in graph.members(0)] == [2, 3, 4, 5]  # the anchor of 1 is not archived
     assert graph.problem().identifiers.tolist() == [2, 3, 4, 5]
+
+
+@pytest.mark.long
+@given(st.lists(ARRAYS, max_size=12), st.sampled_from([64, 256, 4096]))
+def test_arrays_are_kept_as_they_are(arrays, chunk):
+    storage = ArrayStorage(chunk)
+    kept = [storage.keep(array) for array in arrays]
+    for array, copy in zip(arrays, kept, strict=True):
+        assert copy.dtype == array.dtype and copy.flags.c_contiguous
+        np.testing.assert_array_equal(copy, array)
+    for array, copy in zip(arrays, kept, strict=True):  # none shares memory with another one, or with its original
+        copy[...] = 0
+        array[...] = 1
+    assert not any(copy.any() for copy in kept)
+
+
+def test_an_array_that_is_not_contiguous_is_copied_in_order():
+    array = np.arange(12, dtype=np.float32).reshape(3, 4)[:, ::2].T
+    np.testing.assert_array_equal(ArrayStorage().keep(array), array)
+
+
+def test_a_mapping_is_released_with_its_last_array():
+    storage = ArrayStorage(chunk=1024)
+    first, second = storage.keep(np.zeros(512, np.uint8)), storage.keep(np.zeros(512, np.uint8))
+    base = first
+    while isinstance(base, np.ndarray) and base.base is not None:
+        base = base.base
+    mapping = weakref.ref(base.obj if isinstance(base, memoryview) else base)
+    del base
+    storage.keep(np.zeros(8, np.uint8))  # begins the next mapping
+    del first
+    gc.collect()
+    assert mapping() is not None
+    del second
+    gc.collect()
+    assert mapping() is None

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from dvo.ba.cold_start import damping_at
 from dvo.ba.factors import DepthPrior
+from dvo.ba.options import damping_at
 from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.map.window import Keyframe

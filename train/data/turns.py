@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from dvo.core.context import full_precision
 from dvo.core.settings import check_settings
 from dvo.geometry import se3, so3
-from dvo.geometry.precision import full_precision
 from train.data.augment import random_source
 
 SALT = 0x70A2

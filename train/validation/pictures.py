@@ -11,7 +11,7 @@ import torch
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.projection import reproject
 from dvo.metrics import align_trajectory
-from dvo.odometry.frames.working_image import working_image
+from dvo.odometry.frames.gate import working_image
 from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Odometry
 from dvo.viz.plot import ACCENT, INK, PAPER, TRUTH, plan_axes

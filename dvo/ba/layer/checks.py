@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES
+from dvo.ba.checks import REAL, WHOLE, check_tensor
 from dvo.ba.edges import EdgePlan, edge_numbers
 from dvo.ba.factors import DepthDamping, DepthPrior, PosePrior, RelativePose
 from dvo.ba.limits import LARGEST, SHORTEST_FOCAL
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import check_further
-from dvo.ba.tensor_checks import REAL, WHOLE, check_tensor
 from dvo.core.errors import DvoError
 from dvo.core.settings import shown
 

@@ -94,7 +94,7 @@ class SumIndex:
     """Destinations of the sums of :func:`accumulate`, the same in every iteration.
 
     Attributes:
-        slot, free: of the frames, see :func:`dvo.ba.edges.free_slots`.
+        slot, free: of the frames, see :func:`dvo.ba.blocks.free_slots`.
         pairs: by chunk ``(B G,)``, cell of each group among batch and pairs.
         ends: by chunk ``(2 B G M,)``, cells of both frames of each place among batch, slots and patches.
         blocks: ``(4 B P,)`` cells of the 6x6 blocks of the pairs among batch, slots and slots.

@@ -21,9 +21,9 @@ from dvo.ba.layer.transforms import Tensors, composed, finite, pulled_back
 from dvo.ba.limits import LARGEST
 from dvo.ba.options import BADamping
 from dvo.ba.problem import NormalEquations, Problem
+from dvo.core.context import full_precision
 from dvo.core.errors import DvoError
 from dvo.core.kernels import is_batched, is_transformed
-from dvo.geometry.precision import full_precision
 
 
 def normal_equations(problem: Problem, depth_damping: float) -> tuple[NormalEquations, list[Any]]:

@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES, intrinsics_block, inverse_depth_block, pose_block
+from dvo.ba.checks import REAL, WHOLE, check_kind, check_positive, check_range, check_switch, check_tensor, check_within
 from dvo.ba.edges import check_index, plan_edges
 from dvo.ba.kernels import Kernel
-from dvo.ba.limits import HEAVIEST, LARGEST, SHORTEST_FOCAL, check_kind, check_positive, check_range, check_switch
+from dvo.ba.limits import HEAVIEST, LARGEST, SHORTEST_FOCAL
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, State, StateBlock, check_further
 from dvo.ba.sparse.block_parts import PART, BlockParts
@@ -24,10 +25,9 @@ from dvo.ba.sparse.equations import SparseSystem
 from dvo.ba.sparse.global_edges import ReprojectionEdges
 from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
 from dvo.ba.sparse.schur_pattern import SchurPattern, make_schur_pattern
-from dvo.ba.tensor_checks import REAL, WHOLE, check_tensor, check_within
+from dvo.core.context import full_precision
 from dvo.core.errors import DvoError
 from dvo.core.threads import use_threads
-from dvo.geometry.precision import full_precision
 
 
 @dataclass(frozen=True)

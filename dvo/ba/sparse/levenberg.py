@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar, get_args
 
-from dvo.ba.limits import check_kind, check_number, check_whole
+from dvo.ba.checks import check_kind, check_number, check_whole
 from dvo.ba.sparse.block_matrix import CGOptions, LinearSolver
 from dvo.core.errors import DvoError
 from dvo.core.settings import shown

@@ -50,6 +50,7 @@ _USUAL = 640  # width that is assumed for this where the file states none
 _LONGEST = 3.0  # baseline of a pair of cameras on one device, metres
 _BRACE = re.compile(r'\s*\{\s*"')
 _PAIRED = re.compile(r"(k|m|(?:camera_?)?matrix|camera_?mat|mtx|intrinsics?)_?(left|right|l|r|[0-2]|0[0-3])")
+_REGION = ("x_offset", "y_offset", "width", "height")
 _SUFFIX = re.compile(r"(.+?)_?(left|right|l|r|[0-2]|0[0-3])")
 
 
@@ -131,6 +132,8 @@ def _split(value: Any) -> Any:
             found.setdefault(parts[2], {})[parts[1]] = item
         elif bare(str(key)) == "calibration" and _is_row(item) and not {"intrinsics", "coefficients"} & set(value):
             found |= {"intrinsics": item[:4], "coefficients": item[4:]}  # MASt3R-SLAM
+        elif bare(str(key)) == "roi" and isinstance(item, dict) and set(_REGION) <= set(item):
+            found["region_of_sensor"] = [item[part] for part in _REGION]  # ROS
         else:
             found[key] = _split(item)
     return found
@@ -179,7 +182,7 @@ def _last(name: str) -> str:
 def _calibration(entries: Entries, path: Path) -> Calibration:
     calibration, before = _intrinsics(entries, path)
     width, height = _size(entries, path)
-    calibration = replace(calibration, width=width, height=height)
+    calibration = _cropped(replace(calibration, width=width, height=height), entries, path)
     calibration = _with_sensors(calibration, entries, path)
     model, coefficients = _lens(entries, before, path)
     if model == "fov" and width and height and 0 < calibration.cx < 1 and 0 < calibration.cy < 1:  # PTAM, vikit
@@ -290,6 +293,23 @@ def _size(entries: Entries, path: Path) -> tuple[int | None, int | None]:
     if size.shape != (2,) or not ((size >= 0) & (size <= 1e6) & (size == np.rint(size))).all():
         raise DvoError("expected width and height", file=path, field="resolution", remedy="give two whole numbers")
     return int(size[0]) or None, int(size[1]) or None
+
+
+def _cropped(calibration: Calibration, entries: Entries, path: Path) -> Calibration:
+    """Of the region that is read out of the sensor (ROS, ``roi``): K and size are those of the whole one."""
+    numbers = entries.numbers("regionofsensor", shape="list")
+    if numbers is None or numbers.shape != (4,):
+        return calibration
+    left, top, width, height = numbers.tolist()
+    if not (width > 0 and height > 0):  # the whole sensor
+        return calibration
+    outside = calibration.width and calibration.height and (
+        left + width > calibration.width or top + height > calibration.height
+    )  # fmt: skip
+    if min(left, top) < 0 or outside or any(number != int(number) for number in (left, top, width, height)):
+        raise DvoError("a region beyond the image", file=path, field="roi", remedy="leave it out, or mend it")
+    cx, cy = calibration.cx - left, calibration.cy - top
+    return replace(calibration, cx=cx, cy=cy, width=int(width), height=int(height))
 
 
 def _with_sensors(calibration: Calibration, entries: Entries, path: Path) -> Calibration:

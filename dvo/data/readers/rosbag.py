@@ -311,7 +311,9 @@ def calibration_of_info(info: Any, image: str, path: Path) -> Calibration:
     if not min(values["camera_matrix"][0], values["camera_matrix"][4]) > 0:
         raise DvoError("is not calibrated", file=path, field="K", remedy="give a calibration with --calib")
     size = {key: getattr(info, key) for key in ("width", "height") if getattr(info, key)}
-    return from_values({**values, **(size if len(size) == 2 else {})}, path)
+    roi = getattr(info, "roi", None)
+    region = {key: getattr(roi, key, 0) for key in ("x_offset", "y_offset", "width", "height")}
+    return from_values({**values, **(size if len(size) == 2 else {}), "roi": region}, path)
 
 
 def _messages(reader: Any, topic: str) -> Iterator[tuple[Any, int, bytes]]:

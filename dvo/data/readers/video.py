@@ -5,10 +5,13 @@ from __future__ import annotations
 import mmap
 import os
 import re
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +22,7 @@ from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.files.files import is_file, lookups
 from dvo.data.files.output import spelled_in_text
 from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
+from dvo.data.images.fields import DEINTERLACE, INTERLACED, LOOKED_AT, are_interlaced
 from dvo.data.images.image_header import MAX_PIXELS
 from dvo.data.images.images import SUFFIXES, to_rgb8
 from dvo.data.inertial import InertialSamples
@@ -120,6 +124,28 @@ def _is_row_of_jpegs(path: Path) -> bool:
         return file.read(2) == b"\xff\xd8"
 
 
+def _does_not_convert(path: Path) -> bool:
+    """True if FFmpeg says that it cannot convert the interlaced frames at the beginning, as that of OpenCV 5.0 does.
+
+    It leaves the image before in their place, or what stood in the memory, and OpenCV returns it as decoded. How much
+    FFmpeg says is fixed once in a process, so that another one has to listen.
+    """
+    script = (
+        "import cv2, sys; video = cv2.VideoCapture(sys.argv[1], cv2.CAP_FFMPEG); "
+        f"[video.read() for _ in range({LOOKED_AT})]"
+    )
+    with spelled_in_text(path) as name:
+        command, variables = [sys.executable, "-c", script, name], os.environ | {"OPENCV_FFMPEG_LOGLEVEL": "16"}
+        try:
+            said = subprocess.run(
+                command, env=variables, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                timeout=_SECONDS,
+            ).stdout  # fmt: skip
+        except (OSError, subprocess.TimeoutExpired):
+            return False
+    return b"interlaced" in said
+
+
 def _grabs(capture: cv2.VideoCapture) -> Iterator[tuple[int, float, int]]:
     """``(index, container milliseconds, failed grabs just before)`` of every frame that decodes."""
     import cv2
@@ -208,9 +234,11 @@ class VideoRecording:
             self.turned = int(angle) if does_turn else 0
             width, height = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
             self._square = _square_size(width, height, _aspect(capture), self.turned, request.calibration)
-            first = [milliseconds for (_, milliseconds, _), _ in zip(_grabs(capture), range(3), strict=False)]
+            first, interlaced = self._look(capture)
         if not first:
             raise DvoError("no frame of this video decodes", file=path, remedy="check that it plays, or re-encode it")
+        if interlaced:
+            self.warnings.append(INTERLACED)
         # containers without a count give huge or negative numbers
         self.frame_count: int | None = int(announced) if 0 < announced < 1e9 else None
         if self._square is not None:
@@ -239,6 +267,32 @@ class VideoRecording:
             self.warnings.append(
                 f"the video has no times: assuming {known} {self._fps:g} frames a second (or give --fps)"
             )
+
+    def _look(self, capture: cv2.VideoCapture) -> tuple[list[float], bool]:
+        """Times of the first three frames in milliseconds, and if those of the beginning are interlaced."""
+        import cv2
+
+        times: list[float] = []
+        previous, repeats = None, False
+
+        def images() -> Iterator[np.ndarray]:
+            nonlocal previous, repeats
+            for _, milliseconds, _ in islice(_grabs(capture), LOOKED_AT):
+                times.append(milliseconds)
+                decoded, image = capture.retrieve()
+                if decoded and image is not None:
+                    repeats = repeats or (previous is not None and np.array_equal(previous, image))
+                    previous = image
+                    yield image.swapaxes(0, 1) if self.turned in (90, 270) else image
+
+        looked_at = images()
+        interlaced = are_interlaced(looked_at)
+        for _ in islice(looked_at, max(0, 3 - len(times))):
+            pass
+        if repeats and _does_not_convert(self.path):
+            message = f"the frames are interlaced, and this OpenCV ({cv2.__version__}) does not convert such frames"
+            raise DvoError(message, file=self.path, remedy=DEINTERLACE)
+        return times[:3], interlaced
 
     def _read_times(self, file: Path) -> np.ndarray:
         times = read_times(file, None)

@@ -19,7 +19,7 @@ from dvo.data.frame_checks import checked_image
 from dvo.data.streams.live import NOTHING, LiveFrames
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
-from dvo.geometry.undistort import Undistorter, needs_undistortion
+from dvo.geometry.undistort import Undistorter
 
 Item = np.ndarray | tuple[float, np.ndarray] | Frame
 """One element of a stream: an image, a time in seconds with an image, or a frame."""
@@ -165,7 +165,7 @@ def stream(
     if timestamps is not None and fps is not None:
         raise DvoError("both timestamps and fps are given", field="timestamps", remedy="give one of them")
     fps = checked_rate(fps)
-    undistorter = Undistorter(camera) if camera is not None and undistort and needs_undistortion(camera) else None
+    undistorter = Undistorter(camera) if camera is not None and undistort and camera.needs_undistortion else None
     times = _iterator(timestamps, name, "timestamps") if timestamps is not None else None
     if not hasattr(images, "__iter__") and not hasattr(images, "__getitem__"):
         raise _not_iterable(images, name, "images")

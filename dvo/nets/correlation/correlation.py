@@ -25,9 +25,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from dvo.core.context import full_precision
 from dvo.core.errors import DvoError
 from dvo.core.kernels import use_kernels
-from dvo.geometry.precision import full_precision
 from dvo.map.edges import PatchGraph
 from dvo.nets.patch.patchifier import pool_levels
 

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from dvo.geometry.precision import full_precision
+from dvo.core.context import full_precision
 
 Method = Literal["parallel", "sequential"]
 """``parallel``: doubling (Hillis and Steele 1986), in ``log2(L)`` passes over the whole sequence; ``sequential``: one

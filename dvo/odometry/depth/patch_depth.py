@@ -41,26 +41,23 @@ _NEAREST = 0.2  # metres; bundle adjustment leaves out points that are nearer (d
 def measure_depth(
     model: PatchVO, seen: Observation, frame: Frame, options: ScaleOptions, settings: StepSettings
 ) -> Observation:
-    """Measure the depths of the patches of a frame, if that is wanted.
+    """Measure the depths of the patches of a frame.
 
     Args:
         model: the network, which measures in right images.
         seen: the patches.
         frame: of the same image; its depth or right image is read if it is used.
-        options: of the scale, which say what is used.
+        options: of the scale, with ``depth`` or ``stereo``.
         settings: of measurements in right images.
 
     Returns:
-        The observation with ``measured`` and ``slopes``, of zeros for a frame without depth; unchanged without the
-        option.
+        The observation with ``measured`` and ``slopes``, of zeros for a frame without depth.
 
     Raises:
         DvoError: a depth or a right image that is not an image of the size of the frame.
     """
     if options.stereo:
         return measure_stereo(model, seen, frame, settings, options.stereo_error)
-    if not options.depth:
-        return seen
     depth = checked_depth(frame)
     stride = seen.image.shape[0] // seen.bounds[1]
     centres = seen.centres[0, 0].double().cpu().numpy() * stride

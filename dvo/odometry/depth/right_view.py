@@ -12,7 +12,6 @@ from dvo.core.errors import DvoError
 from dvo.data.frame import Frame, StereoView
 from dvo.data.frame_checks import checked_frame
 from dvo.geometry.poses import invert_poses
-from dvo.geometry.undistort import needs_undistortion
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ def right_view(frame: Frame, width: int, height: int) -> RightView | None:
     if image.shape != frame.image.shape:
         message = "is {1}x{0}, the left image {3}x{2} (width x height)".format(*image.shape[:2], *frame.image.shape[:2])
         raise DvoError(message, field=field, remedy="give both images of a pair at one size")
-    if needs_undistortion(view.camera):
+    if view.camera.needs_undistortion:
         remedy = "undistort both images first: dvo.geometry.undistort.Undistorter, or dvo.open, which does this"
         raise DvoError(f"has {view.camera.model} distortion", field=field, remedy=remedy)
     pose = np.asarray(view.T_left_right, dtype=np.float64)

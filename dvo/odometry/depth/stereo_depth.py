@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from dvo.ba.cold_start import COLD_UPDATES, damping_at
+from dvo.ba.options import COLD_UPDATES, damping_at
 from dvo.data.frame import Frame
 from dvo.geometry import se3
 from dvo.geometry.projection import Reprojection, reproject

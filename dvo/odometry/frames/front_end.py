@@ -119,7 +119,7 @@ def observe(
 
     Args:
         model: the network.
-        image: ``(H, W, 3)`` uint8 RGB, see :func:`dvo.odometry.frames.working_image.working_image`.
+        image: ``(H, W, 3)`` uint8 RGB, see :func:`dvo.odometry.frames.gate.working_image`.
         camera: of the image.
         select: selection of the patches, with their number and the generator given (:mod:`dvo.nets.patch.selection`).
         device: of the network.

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.cold_start import COLD_UPDATES, damping_at
+from dvo.ba.options import COLD_UPDATES, damping_at
 from dvo.geometry import se3, so3
 from dvo.map.archive import ArchivedKeyframe
 from dvo.map.features import FeatureCache

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.data.frame import Frame
 from dvo.data.inertial import InertialSamples, checked_samples
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
@@ -61,13 +60,14 @@ class InertialTracking:
     Attributes:
         estimator: of scale, vertical, velocity and biases.
         coupling: measurements for the window.
+        active: there are samples, and they are used; poses are predicted and expressed only then.
     """
 
     def __init__(
         self, options: InertialOptions, graph: KeyframeGraph, *, metric: bool = False, variance: float = 1.0,
         optimised: int = 8,
     ) -> None:  # fmt: skip
-        self.options, self.graph, self.metric = options, graph, metric
+        self.options, self.graph, self.metric, self.active = options, graph, metric, False
         self._unused = ""  # why samples are not used
         self.estimator = InertialEstimator(options)
         self.coupling = InertialCoupling(self.estimator, self._similarity, variance, optimised)
@@ -78,23 +78,9 @@ class InertialTracking:
         self._state: BodyState | None = None  # the newest prediction
         self._way = 0.0  # metres since the alignment
 
-    @property
-    def active(self) -> bool:
-        """True if there are samples, and they are used."""
-        return self.estimator.state is not ScaleState.NONE
-
     def turns(self) -> Turns | None:
         """Rotations by the gyroscope, for the readout of a rolling shutter; None if it does not tell them."""
         return self.estimator.turns(self._nodes(-np.inf)[0]) if self.active else None
-
-    def observe(self, frame: Frame) -> None:
-        """Take the samples of a frame.
-
-        Args:
-            frame: the next one.
-        """
-        if self.options.use and frame.inertial is not None:
-            self.add(frame.inertial)
 
     def add(self, samples: InertialSamples) -> None:
         """Take samples.
@@ -106,6 +92,7 @@ class InertialTracking:
             self._unused = "a map that is tracked in keeps its own unit and axes"
         elif self.options.use:
             self.estimator.add(samples)
+            self.active = self.estimator.state is not ScaleState.NONE
 
     def predicted(self, time: float, pose_cw: Tensor) -> Tensor:
         """First pose of a new frame.
@@ -118,8 +105,6 @@ class InertialTracking:
             ``(7,)``: with the rotation by the gyroscope where that predicts better than the motion model has of late,
             and where the images have been missing with the position too.
         """
-        if not self.active:
-            return pose_cw
         similarity = self._similarity()
         if self._state is not None and similarity is not None:  # images are back
             state = self._predict(time)
@@ -143,8 +128,6 @@ class InertialTracking:
         Returns:
             In metres and upright once that is known; a predicted pose where the images give none.
         """
-        if not self.active:
-            return estimate
         time, estimator = record.timestamp, self.estimator
         if estimate.pose_wc is not None:
             self._compare(time, estimate.pose_wc)

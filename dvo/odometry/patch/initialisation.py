@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dvo.ba.cold_start import damping_at
 from dvo.ba.multistart import (
     AS_THEY_ARE,
     COLD_STARTS,
@@ -14,6 +13,7 @@ from dvo.ba.multistart import (
     preferred,
     present,
 )
+from dvo.ba.options import damping_at
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.window import Window
 from dvo.models.step import Revision, StepOptions
@@ -25,10 +25,6 @@ from dvo.odometry.window.motion import parallax
 from dvo.odometry.window.patch_window import PatchWindow
 from dvo.odometry.window.pose_validation import last_unrelated, measured
 
-RESTART_AGES = frozenset({4, 8, 16, 32})
-"""Numbers of frames after the initialisation at which its solution is compared with others."""
-RETRY_EVERY = 8
-"""Frames from one comparison to the next as long as another solution is nearly as good."""
 MOVED_SHARE = 0.2
 """Share of the patches that have to move: the others may be far away, or fixed to the camera."""
 SLOW_START = (0.3, 0.6)
@@ -192,21 +188,6 @@ def drop_unrelated(graph: KeyframeGraph, patch_window: PatchWindow, config: Trac
     if count:
         graph.reject(graph.window.frames[count].identifier, NO_MATCH)
     return count > 0
-
-
-def restart_due(age: int, ambiguous: bool) -> bool:
-    """Tell if a second solution is looked for after a frame (:func:`leave_minimum`).
-
-    The first frames have too little parallax to tell a relief from the reversed one; later frames have more.
-
-    Args:
-        age: number of frames since the initialisation.
-        ambiguous: another solution was nearly as good the last time.
-
-    Returns:
-        True at :data:`RESTART_AGES`, and each :data:`RETRY_EVERY` frames as long as the window is ambiguous.
-    """
-    return age in RESTART_AGES or (ambiguous and age % RETRY_EVERY == 0)
 
 
 def leave_minimum(patch_window: PatchWindow, config: TrackerConfig, beside: Beside | None = None) -> bool:

@@ -32,7 +32,7 @@ KERNELS = {
     "dvo.odometry.window.window_kernels:support": (
         "i8, b1, i8[::1], i8[::1], i8, f4[:,::1], f4[:,:,:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f8, f8, f8"
     ),
-    "dvo.odometry.window.frame_alignment_kernels:solve_pose_kernel": (
+    "dvo.odometry.window.window_kernels:solve_pose_kernel": (
         "f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], i8, f8, f8"
     ),
     "dvo.ba.sparse.schur_kernels:observations": "i8[::1], i8[::1], i8, i8",

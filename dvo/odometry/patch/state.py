@@ -16,6 +16,11 @@ from dvo.odometry.patch.map_tables import MapTable
 from dvo.odometry.protocol import Estimate
 from dvo.odometry.quality import Quality
 
+RESTART_AGES = frozenset({4, 8, 16, 32})
+"""Numbers of frames after the initialisation at which its solution is compared with others."""
+RETRY_EVERY = 8
+"""Frames from one comparison to the next as long as another solution is nearly as good."""
+
 
 class Phase(Enum):
     """What a tracker does with the next frame that has content."""
@@ -90,6 +95,15 @@ class TrackerState:
     def initialised(self) -> bool:
         """True if the segment has poses."""
         return self.phase is not Phase.INITIALISING
+
+    @property
+    def restart_due(self) -> bool:
+        """True if a second solution is looked for now (:func:`dvo.odometry.patch.initialisation.leave_minimum`).
+
+        The first frames have too little parallax to tell a relief from the reversed one; later frames have more: at
+        :data:`RESTART_AGES`, and each :data:`RETRY_EVERY` frames as long as the window is ambiguous.
+        """
+        return self.tracked in RESTART_AGES or (self.ambiguous and self.tracked % RETRY_EVERY == 0)
 
     def begin_segment(self) -> None:
         """Forget the segment that has been closed."""

@@ -40,13 +40,7 @@ from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.finishing import finish_segments, judge_result, run_information
 from dvo.odometry.patch.inertial import InertialTracking
 from dvo.odometry.patch.initial_pose import first_depth, first_pose
-from dvo.odometry.patch.initialisation import (
-    NOT_INITIALISED,
-    first_motion,
-    initialise_related,
-    leave_minimum,
-    restart_due,
-)
+from dvo.odometry.patch.initialisation import NOT_INITIALISED, first_motion, initialise_related, leave_minimum
 from dvo.odometry.patch.kernels import load_in_background
 from dvo.odometry.patch.loops import loop_closer
 from dvo.odometry.patch.new_recording import begin_in_map
@@ -55,8 +49,7 @@ from dvo.odometry.patch.saving import save_map
 from dvo.odometry.patch.state import Phase, TrackerState
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import result_of
-from dvo.odometry.uncertainty.measurements import WindowMeasurements
-from dvo.odometry.uncertainty.uncertainty import LaterUncertainty
+from dvo.odometry.uncertainty.uncertainty import LaterUncertainty, WindowMeasurements
 from dvo.odometry.window.frame_alignment import FrameAlignment
 from dvo.odometry.window.motion import flow_magnitude
 from dvo.odometry.window.patch_window import PatchWindow
@@ -129,8 +122,7 @@ class PatchOdometry:
             config.inertial, self.graph, metric=config.scale.source != "none", variance=config.variance,
             optimised=config.optimisation,
         )  # fmt: skip
-        sensors = *self.sensors, self.inertial.coupling
-        self.patch_window = PatchWindow(self.model, self.window, config.measuring, self.device, sensors)
+        self.patch_window = PatchWindow(self.model, self.window, config.measuring, self.device, self.sensors)
         self.aligner: FrameAlignment | None = None
         if config.aligned_motion > 0 and not self.sensors:
             self.aligner = FrameAlignment(self.patch_window, config.alignment, config.motion_damping)
@@ -166,15 +158,20 @@ class PatchOdometry:
         with core_left(self.loops.maintenance.occupies_core), self.gate.admit(frame) as admitted:
             for sensor in self.sensors:
                 sensor.observe(admitted.frame)
-            self.inertial.observe(admitted.frame)
+            if self.config.inertial.use and admitted.frame.inertial is not None:
+                self.inertial.add(admitted.frame.inertial)
+            if self.inertial.active:
+                self.patch_window.sensors = *self.sensors, self.inertial.coupling
             state.shutter = Shutter(admitted.camera.readout, admitted.camera.height / self.model.config.STRIDE)
             if state.map is not None:
                 begin_in_map(self.graph, self.loops.finder, state)
             record = self.graph.log.add(admitted.timestamp)
             if admitted.repeated:
-                return self.inertial.express(record, self._repeat(record))
-            state.last = self._lose(record, admitted.problem) if admitted.problem else self._measure(record, admitted)
-            return self.inertial.express(record, state.last)
+                estimate = self._repeat(record)
+            else:
+                estimate = self._lose(record, admitted.problem) if admitted.problem else self._measure(record, admitted)
+            state.last = estimate
+            return self.inertial.express(record, estimate) if self.inertial.active else estimate
 
     def _measure(self, record: FrameRecord, admitted: Admitted) -> Estimate:
         """Process a frame with content."""
@@ -187,7 +184,8 @@ class PatchOdometry:
         if self.aligner is not None:
             self.aligner.age = 0
         seen = observe(self.model, image, admitted.camera, self.select, self.device, mask=mask)
-        seen = measure_depth(self.model, seen, admitted.frame, self.config.scale, self.config.measuring)
+        if self.config.scale.depth or self.config.scale.stereo:
+            seen = measure_depth(self.model, seen, admitted.frame, self.config.scale, self.config.measuring)
         state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
         state.checks.see(len(self.graph.log.frames) - 1, image, seen.image_intrinsics, mask)
         estimate = self._take(View([record], seen))
@@ -329,9 +327,10 @@ class PatchOdometry:
             return self._lose(record, NO_MATCH)
         record.place(identifier, self.graph.segment, state.resume())
         state.tracked += 1
-        if config.restart and restart_due(state.tracked, state.ambiguous) and not window.guests:
+        if config.restart and state.restart_due and not window.guests:
             state.ambiguous = leave_minimum(self.patch_window, config, self.loops.maintenance.helper)
-        retry_waiting(self.graph, self.patch_window, state, config, record)
+        if state.waiting:
+            retry_waiting(self.graph, self.patch_window, state, config, record)
         if self.graph.located is not None and state.tracked % REFRESH_EVERY == 0:
             hold_to_map(self.graph, self.patch_window, self.loops.finder)
         self._reduce()  # may correct the window
@@ -411,8 +410,7 @@ class PatchOdometry:
         record.follow(past)
         if state.waiting and state.waiting[-1].records[-1] is past:
             state.waiting[-1].records.append(record)
-        state.last = replace(state.last, timestamp=record.timestamp, recovered=False)
-        return state.last
+        return replace(state.last, timestamp=record.timestamp, recovered=False)
 
     def _lose(self, record: FrameRecord, reason: str) -> Estimate:
         """Mark a frame as lost; the next frame of an initialised segment has to be joined across it."""
@@ -455,7 +453,7 @@ class PatchOdometry:
             return torch.from_numpy(guess).to(window.poses_cw), depth
         time = view.records[0].timestamp
         pose = first_pose(window, seen, time, config, initialised)
-        return self.inertial.predicted(time, pose) if initialised else pose, depth
+        return self.inertial.predicted(time, pose) if initialised and self.inertial.active else pose, depth
 
     def _reduce(self) -> None:
         """Drop a redundant keyframe, and archive edges and keyframes beyond the maximum age."""

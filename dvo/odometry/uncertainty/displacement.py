@@ -7,28 +7,11 @@ import math
 import numpy as np
 import torch
 
-from dvo.odometry.uncertainty.measurements import WindowMeasurements
-
 TOLERANCE = 0.5
 """Reprojection error that the confidence is the probability of staying below, pixels of an image of 320x240."""
 
 _PIXELS = 320 * 240
-_DEPTH_FRAMES = 3  # newest frames whose median depth is taken for that of the scene
 _GRID = (np.stack(np.meshgrid(np.arange(4), np.arange(3)), -1).reshape(-1, 2) + 0.5) / (4, 3)  # as shares of the image
-
-
-def window_metric(window: WindowMeasurements) -> np.ndarray:
-    """:func:`flow_metric` of the newest frame of a window.
-
-    Args:
-        window: its measurements.
-
-    Returns:
-        ``(6, 6)`` float64.
-    """
-    problem = window.problem
-    depths = problem.inverse_depths[-_DEPTH_FRAMES * problem.per_frame :]
-    return flow_metric(problem.intrinsics[-1].double().cpu().numpy(), window.bounds, float(depths.median()))
 
 
 def flow_metric(intrinsics: np.ndarray, size: tuple[int, int], inverse_depth: float) -> np.ndarray:

@@ -353,7 +353,7 @@ def solve_pose(
     widths: tuple[float, ...],
 ) -> np.ndarray:  # fmt: skip
     """Compiled :func:`solve_pose_plain`."""
-    from dvo.odometry.window.frame_alignment_kernels import solve_pose_kernel
+    from dvo.odometry.window.window_kernels import solve_pose_kernel
 
     found = np.array(pose)
     points, measured, weights = (np.ascontiguousarray(x, np.float64) for x in (points, measured, weights))

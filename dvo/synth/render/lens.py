@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera, DistortionModel
-from dvo.geometry.undistort import distort, in_range, needs_undistortion, undistort
+from dvo.geometry.undistort import distort, in_range, undistort
 from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.render.quality import STANDARD, Quality
 from dvo.synth.render.renderer import Rendering, cast, render, trace, view_scene
@@ -40,7 +40,7 @@ def undistorted_pixels(pixels: Array, camera: Camera) -> Array:
     Returns:
         ``(..., 2)`` pixels of the pinhole camera with the same intrinsics; NaN outside the range of the lens model.
     """
-    if not needs_undistortion(camera):
+    if not camera.needs_undistortion:
         return pixels
     focal, centre = camera.intrinsics[:2], camera.intrinsics[2:]
     return undistort((pixels - centre) / focal, camera) * focal + centre
@@ -56,7 +56,7 @@ def distorted_pixels(pixels: Array, camera: Camera) -> Array:
     Returns:
         ``(..., 2)`` pixels of the camera with distortion; far outside the image beyond the range of the lens model.
     """
-    if not needs_undistortion(camera):
+    if not camera.needs_undistortion:
         return pixels
     focal, centre = camera.intrinsics[:2], camera.intrinsics[2:]
     ideal = (pixels - centre) / focal

@@ -16,7 +16,6 @@ import torch
 from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import compose_rodrigues, pose_from, quaternion_to_matrix, split
-from dvo.geometry.undistort import needs_undistortion
 from dvo.synth.protocols import Motion
 from dvo.synth.render.lens import distorted_pixels, plate_of, render_lens, undistorted_pixels
 from dvo.synth.render.quality import Quality
@@ -103,7 +102,7 @@ class Shot:
     device: torch.device | str = "cpu"
 
     def __post_init__(self) -> None:
-        if self.readout > 0 and needs_undistortion(self.camera):
+        if self.readout > 0 and self.camera.needs_undistortion:
             raise DvoError(
                 "a rolling shutter is not rendered through a lens with distortion",
                 field="readout, camera",
@@ -149,7 +148,7 @@ class Shot:
 
     def _render(self, poses_wc: Array, when: Array, supersample: int = 1, coordinates: bool = True) -> Rendering:
         """Sharp frames ``(N, ...)`` with a global shutter."""
-        if needs_undistortion(self.camera):
+        if self.camera.needs_undistortion:
             return render_lens(
                 self.scene, poses_wc, self.camera, times=when, quality=Quality(supersample), device=self.device,
                 coordinates=coordinates,
@@ -300,7 +299,7 @@ class Shot:
         k = self.camera.intrinsics
         if self.readout <= 0:
             when, size = np.array([time]), self._size
-            if needs_undistortion(self.camera):  # through the pinhole picture that covers what the lens sees
+            if self.camera.needs_undistortion:  # through the pinhole picture that covers what the lens sees
                 plate = plate_of(self.camera, 2)
                 pixels = undistorted_pixels(pixels, self.camera) + (plate.intrinsics - k)[2:]
                 k, size = plate.intrinsics, plate.size

@@ -41,7 +41,6 @@ from dvo.data.inertial import NOISE_PRESETS, InertialSamples
 from dvo.data.trajectory import Trajectory, read_tum
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import invert_poses, pose_matrices, poses_from_matrices
-from dvo.geometry.undistort import needs_undistortion
 from dvo.odometry.protocol import Estimate, Result, ScaleState, Status
 from eval.systems.peers.common import Pictures, Row, missing_module, result, version_of
 
@@ -290,7 +289,7 @@ def rectified_view(frame: Frame) -> StereoView:
     if view is None:
         raise _lacks(frame, "right")
     aside = np.abs(view.T_left_right[1:6]).max() > 1e-6 or view.T_left_right[0] <= 0
-    if aside or view.camera != frame.camera or needs_undistortion(frame.camera):
+    if aside or view.camera != frame.camera or frame.camera.needs_undistortion:
         remedy = "rectify the images; this peer is given rectified pairs only"
         raise DvoError("not a rectified stereo pair", field=f"frame {frame.index}: right", remedy=remedy)
     return view

@@ -33,7 +33,7 @@ import dvo
 from dvo.data.images.images import used_bits
 from dvo.data.readers.ros_images import decode_message, raw_levels
 from dvo.data.readers.rosbag import calibration_of_info
-from dvo.geometry.undistort import Undistorter, needs_undistortion
+from dvo.geometry.undistort import Undistorter
 from dvo_ros.base_motion import BaseMotion, BaseState
 
 try:
@@ -79,7 +79,7 @@ class Lens:
         calibration = calibration_of_info(info, topic.rpartition("/")[2], FilePath("camera_info"))
         self.size = image.shape
         camera = calibration.camera(image.shape[1], image.shape[0])
-        self._undistorter = Undistorter(camera) if needs_undistortion(camera) else None
+        self._undistorter = Undistorter(camera) if camera.needs_undistortion else None
         self.camera = self._undistorter.camera if self._undistorter else camera
         self._numbers = numbers_of(info)
 

@@ -728,3 +728,28 @@ def test_values_in_another_unit_and_coefficients_without_a_model_are_told(make, 
                                   f"fisheye: 1\nD: {list(KC)}", "depth_scale: 5000\nbaseline: 0.12"])  # fmt: skip
 def test_what_is_plain_needs_no_note(make, line):
     assert not read_calibration(make.text("c.yaml", f"{PINHOLE}{line}\n")).notes
+
+
+INFO = """width: 640
+height: 480
+distortion_model: plumb_bob
+d: [0.1, 0.0, 0.0, 0.0, 0.0]
+k: [500, 0, 321, 0, 510, 241, 0, 0, 1]
+roi: {{x_offset: {}, y_offset: {}, height: {}, width: {}, do_rectify: false}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("region", "principal", "size"),
+    [((0, 0, 0, 0), (321, 241), (640, 480)), ((100, 50, 240, 320), (221, 191), (320, 240))],
+)
+def test_the_region_that_a_ros_camera_reads_out(make, region, principal, size):
+    """K and size of sensor_msgs/CameraInfo are those of the whole sensor, images those of the region."""
+    found = read_calibration(make.text("camera_info.yaml", INFO.format(*region)))
+    assert (found.fx, found.fy, found.cx, found.cy) == (500, 510, *principal)
+    assert (found.width, found.height) == size
+
+
+def test_a_region_beyond_the_sensor(make):
+    with pytest.raises(DvoError, match="roi"):
+        read_calibration(make.text("camera_info.yaml", INFO.format(400, 50, 240, 320)))

@@ -12,7 +12,7 @@ from dvo.core.errors import DvoError
 from dvo.data.companions.depth_source import with_depth
 from dvo.data.companions.right_source import with_right
 from dvo.data.readers.ros_images import decode_message
-from dvo.data.readers.rosbag import matches, split_topic
+from dvo.data.readers.rosbag import calibration_of_info, matches, split_topic
 from tests.support.rosbags import PLUMB, Bag, P
 
 
@@ -295,3 +295,15 @@ def test_few_bits_of_16_in_messages(make):
     source = dvo.open(path, calib=make.calib())
     assert np.array_equal(list(source)[2].image[..., 0], rgb(make, 2)[..., 1])
     assert "hold 12 bits" in source.warnings[0]
+
+
+@pytest.mark.parametrize(("region", "principal", "size"), [((0, 0, 0, 0), (321, 241), (640, 480)),
+                                                           ((100, 50, 320, 240), (221, 191), (320, 240))])  # fmt: skip
+def test_images_of_a_region_of_the_sensor(tmp_path, region, principal, size):
+    roi = SimpleNamespace(**dict(zip(("x_offset", "y_offset", "width", "height"), region, strict=True)))
+    k, p = [500, 0, 321, 0, 510, 241, 0, 0, 1], [500, 0, 321, 0, 0, 510, 241, 0, 0, 0, 1, 0]
+    info = SimpleNamespace(
+        width=640, height=480, distortion_model="plumb_bob", k=k, d=[0.1, 0, 0, 0, 0], r=[], p=p, roi=roi
+    )
+    found = calibration_of_info(info, "image_raw", tmp_path / "a.bag")
+    assert (found.cx, found.cy, found.width, found.height) == (*principal, *size)

@@ -16,7 +16,7 @@ from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
-from dvo.map.storage import ArrayStorage
+from dvo.map.archive import ArrayStorage
 from dvo.odometry.protocol import Segment
 from eval.benchmarks.loops.__main__ import blackout_sequences, check_out, line, read_runs, run_all
 from eval.benchmarks.loops.processes import Alternating

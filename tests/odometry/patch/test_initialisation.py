@@ -10,7 +10,8 @@ from dvo.geometry import se3
 from dvo.odometry.depth.depth_factor import MEASURED_SHARE, measured_share
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.patch.config import TrackerConfig
-from dvo.odometry.patch.initialisation import RESTART_AGES, leave_minimum, restart_due
+from dvo.odometry.patch.initialisation import leave_minimum
+from dvo.odometry.patch.state import RESTART_AGES, TrackerState
 from dvo.odometry.window.patch_window import StepSettings
 from tests.support.archived_walk import archived_walk, pose_at
 
@@ -56,8 +57,11 @@ def test_a_window_that_the_measurements_do_not_decide_is_ambiguous():
 
 
 def test_frames_at_which_a_second_solution_is_looked_for():
-    assert {age for age in range(1, 200) if restart_due(age, False)} == RESTART_AGES
-    assert {age for age in range(33, 200) if restart_due(age, True)} == set(range(40, 200, 8))
+    def due(age: int, ambiguous: bool) -> bool:
+        return TrackerState(torch.Generator(), tracked=age, ambiguous=ambiguous).restart_due
+
+    assert {age for age in range(1, 200) if due(age, False)} == RESTART_AGES
+    assert {age for age in range(33, 200) if due(age, True)} == set(range(40, 200, 8))
 
 
 def test_nothing_is_tried_where_depths_are_measured():

@@ -14,11 +14,10 @@ from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.uncertainty import uncertainty
-from dvo.odometry.uncertainty.displacement import TOLERANCE, window_metric
+from dvo.odometry.uncertainty.displacement import TOLERANCE
 from dvo.odometry.uncertainty.gauge import Gauge, relative_error, window_gauge
-from dvo.odometry.uncertainty.measurements import WindowMeasurements
 from dvo.odometry.uncertainty.second_solution import INDEPENDENT, second_solutions, window_solutions
-from dvo.odometry.uncertainty.uncertainty import LaterUncertainty, newest_uncertainty
+from dvo.odometry.uncertainty.uncertainty import LaterUncertainty, WindowMeasurements, newest_uncertainty, window_metric
 from dvo.odometry.window.patch_window import StepSettings
 from tests.support.archived_walk import archived_walk, pose_at
 

@@ -24,8 +24,7 @@ from dvo.odometry.protocol import Estimate, Status
 from dvo.odometry.uncertainty import uncertainty
 from dvo.odometry.uncertainty.displacement import confidence_of, flow_metric
 from dvo.odometry.uncertainty.gauge import window_gauge
-from dvo.odometry.uncertainty.measurements import WindowMeasurements
-from dvo.odometry.uncertainty.uncertainty import UNKNOWN, LaterUncertainty, newest_uncertainty
+from dvo.odometry.uncertainty.uncertainty import UNKNOWN, LaterUncertainty, WindowMeasurements, newest_uncertainty
 from dvo.synth.sequence import make_sequence
 
 FAST = {"pixels": 160 * 120, "patches": 12, "lifetime": 5, "removal": 6, "initial_updates": 6, "restart": False}

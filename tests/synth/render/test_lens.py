@@ -13,7 +13,7 @@ from dvo.core.errors import DvoError
 from dvo.data.open import open_source
 from dvo.geometry.camera import Camera
 from dvo.geometry.undistort import Undistorter
-from dvo.odometry.frames.working_image import working_image
+from dvo.odometry.frames.gate import working_image
 from dvo.synth import Shot, make_sequence, mesh_scene, random_path, random_scene, render, trace
 from dvo.synth.export import export_sequence
 from dvo.synth.render.lens import distorted_pixels, plate_of, random_lens, render_lens, undistorted_pixels

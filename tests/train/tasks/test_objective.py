@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dvo.ba.cold_start import damping_at
 from dvo.ba.layer.layer import BAOptions, bundle_adjust
 from dvo.ba.multistart import COLD_STARTS, multistart
+from dvo.ba.options import damping_at
 from dvo.ba.patch_problem import PatchProblem
 from dvo.core.errors import DvoError
 from dvo.core.registry import Registry

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dvo.core.context import full_precision
 from dvo.core.settings import check_settings
 from dvo.geometry import se3, so3
-from dvo.geometry.precision import full_precision
 from dvo.losses.two_frame import (
     UpToScale,
     flow_errors,

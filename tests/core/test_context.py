@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dvo.geometry.precision import full_precision
+from dvo.core.context import full_precision
 
 
 def test_autocast_is_off_inside_and_back_on_after() -> None:

@@ -16,7 +16,8 @@ from importlib import import_module
 import pytest
 
 from dvo.commands import kernels
-from dvo.commands.kernels import KERNELS, compiled_meanwhile, done_file
+from dvo.commands.kernels import compiled_meanwhile, done_file
+from dvo.odometry.patch.kernels import KERNELS
 
 
 def command(**options):

@@ -5,53 +5,65 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import threading
 
 import numpy as np
 import pytest
 
 import dvo
 from dvo.cli import main
+from dvo.commands import kernels
 from dvo.data.trajectory import read_tum
-from dvo.demo import _frames, render_clip
-from dvo.synth.sequence import make_sequence
+from dvo.demo import RenderedClip, rendering
+
+
+@pytest.fixture
+def two_cores(monkeypatch):
+    monkeypatch.setattr(kernels, "available_cores", lambda: 2)
+    monkeypatch.setattr(kernels, "memory_of_group", lambda *_: None)
 
 
 @pytest.mark.long
-def test_the_clip_is_the_same_every_time_and_moves():
-    first, second = render_clip(5), render_clip(5)
-    assert first.frame_count == 5 and first.groundtruth is not None
+def test_another_process_renders_the_same_clip_and_it_moves(two_cores):
+    with rendering(5) as renderer:
+        assert renderer is not None
+        clips = RenderedClip(5), RenderedClip(5, renderer)
+        first, second = (list(clip) for clip in clips)
+        assert [list(clip) for clip in clips] == [first, second]  # they can be read again
+    assert len(first) == len(second) == clips[0].frame_count == clips[1].frame_count == 5
     for a, b in zip(first, second, strict=True):
-        assert a.timestamp == b.timestamp and a.image.shape == (240, 320, 3)
+        assert a.index == b.index and a.timestamp == b.timestamp and a.camera == b.camera
+        assert a.image.shape == (240, 320, 3)
         np.testing.assert_array_equal(a.image, b.image)
+    truths = [clip.groundtruth for clip in clips]
+    assert truths[0] is not None and truths[1] is not None
+    np.testing.assert_array_equal(truths[0].poses_wc, truths[1].poses_wc)
     assert np.abs(np.diff([frame.image.astype(float) for frame in first], axis=0)).mean() > 0.5
-    assert first.groundtruth.path_length > 0.01
+    assert truths[0].path_length > 0.01
 
 
 @pytest.mark.long
-def test_threads_render_what_one_does_and_stop_when_asked_to(monkeypatch):
-    sequence = make_sequence(0, frames=40, family="room")
-    for one, several in zip(_frames(sequence, 1), [*zip(range(6), _frames(sequence, 3), strict=False)], strict=False):
-        assert one.index == several[0] == several[1].index
-        np.testing.assert_array_equal(one.image, several[1].image)
-    rendered, stop = [], threading.Event()
+def test_what_the_process_does_not_bring_is_rendered_here(two_cores):
+    expected = list(RenderedClip(4))
+    with rendering(4) as renderer:
+        assert renderer is not None
+        clip = RenderedClip(4, renderer)
+        renderer.close()
+        for a, b in zip(clip, expected, strict=True):
+            np.testing.assert_array_equal(a.image, b.image)
+        assert len(list(RenderedClip(4, renderer))) == 4  # from the beginning
 
-    def slow(_, index):
-        rendered.append(index)
-        if index > 1:
-            stop.wait(30)
 
-    monkeypatch.setattr(type(sequence), "frame", slow)
-    frames = _frames(sequence, 2)
-    next(frames), next(frames)
-    threading.Timer(0.2, stop.set).start()  # when all others are cancelled
-    frames.close()
-    assert len(rendered) < 20
+def test_no_process_without_a_core_or_memory_for_it(two_cores, monkeypatch):
+    for change in ("available_cores", lambda: 1), ("memory_of_group", lambda *_: 900 * 2**20):
+        with monkeypatch.context() as patch:
+            patch.setattr(kernels, *change)
+            with rendering(3) as renderer:
+                assert renderer is None
 
 
 @pytest.mark.long
 def test_demo_reports_the_error_against_ground_truth(monkeypatch, fake_odometry, tmp_path, capsys):
-    truth = render_clip(12).groundtruth
+    truth = RenderedClip(12).groundtruth
     assert truth is not None
 
     def motion(stamp: float) -> np.ndarray:

@@ -19,65 +19,7 @@ from pathlib import Path
 from dvo.core.ahead import compiled_by
 from dvo.core.limits import TRACKING, memory_of_group
 from dvo.core.threads import CGROUPS, MEMBERSHIP, available_cores
-
-KERNELS = {
-    "dvo.geometry.projection_kernels:project_patches": (
-        "f4[:,:,::1], f4[:,:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8[::1], f8, f8, f4[:,:,:,::1], "
-        "f4[:,:,::1], b1[:,:,::1]"
-    ),
-    "dvo.nets.correlation.edge_correlation_kernels:correlate": (
-        "f4[:,:,:,::1], f4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, f4[:,:,:,::1]"
-    ),
-    "dvo.nets.alignment.alignment_kernels:align": (
-        "f4[:,:,::1], i8[::1], i8[::1], f4[:,::1], f4[:,::1], f4[:,:,::1], i8, i8, f8, f8, f4[:,::1], f4[:,::1]"
-    ),
-    "dvo.ba.layer.edgewise_kernels:frame_pairs": "i8[::1], i8[::1], i8[::1], i8, i8",
-    "dvo.ba.layer.edgewise_kernels:take_steps": (
-        "f4[:,:,::1], f4[:,::1], f4[:,:,::1], f4[:,:,::1], f4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], "
-        "i8[::1], i8[::1], i8[:,::1], i8[::1], i8, b1, UniTuple(f8, 7), i8, f8, f8, f8, f8, f8, i8"
-    ),
-    "dvo.odometry.window.window_kernels:support": (
-        "i8, b1, i8[::1], i8[::1], i8, f4[:,::1], f4[:,:,:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f8, f8, f8"
-    ),
-    "dvo.odometry.window.window_kernels:solve_pose_kernel": (
-        "f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], i8, f8, f8"
-    ),
-    "dvo.ba.sparse.schur_kernels:observations": "i8[::1], i8[::1], i8, i8",
-    "dvo.ba.sparse.schur_kernels:find": "i8[::1], i8[::1], i8[::1], i8[::1], i8",
-    "dvo.ba.sparse.edge_kernels:cost": (
-        "f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], i8[::1], i8[::1], "
-        "i8[::1], i8[::1], b1[:,::1], i8[::1], i8, f8, f8"
-    ),
-    "dvo.ba.sparse.edge_kernels:accumulate": (
-        "f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], i8[::1], i8[::1], "
-        "i8[::1], i8[::1], b1[:,::1], i8[::1], i8, f8, f8, i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], "
-        "f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1]"
-    ),
-    "dvo.ba.sparse.schur_kernels:to_poses": "f8[:,::1], i8[::1], i8[::1], i8, f8[::1], f8[:,::1]",
-    "dvo.ba.sparse.schur_kernels:coupled": "i8[::1], i8[::1], i8, i8, i8[::1]",
-    "dvo.ba.sparse.schur_kernels:reduce": (
-        "f8[:,::1], i8[::1], i8[::1], f8[::1], i8, i8[::1], i8[::1], i8[::1], i8[::1], f8[:,:,::1]"
-    ),
-    "dvo.ba.sparse.column_kernels:eliminate": "i8, i8[::1], i8[::1], i8",
-    "dvo.ba.sparse.column_kernels:places": "i8[::1], i8[::1], i8[::1], i8[::1], i8[::1]",
-    "dvo.ba.sparse.column_kernels:solve": (
-        "i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], i8[::1], f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1]"
-    ),
-    "dvo.ba.sparse.schur_kernels:to_depths": "f8[:,::1], i8[::1], i8[::1], i8, f8[:,::1], f8[::1]",
-    "dvo.ba.sparse.edge_kernels:inliers": (
-        "f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], i8[::1], i8[::1], "
-        "i8[::1], i8[::1], b1[:,::1], i8[::1], f8"
-    ),
-    "dvo.odometry.window.window_kernels:mean_flow": "f4[::1], f4[::1], f4[::1], f4[::1], f4[:,:,:,::1], f8, f8",
-    "dvo.odometry.global_ba.shutter_kernels:global_shutter": (
-        "f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], i8[::1], i8[::1], i8[::1], "
-        "i8[::1], f8[:,::1], f8[:,:,::1], f8, f8, f8"
-    ),
-    "dvo.odometry.checks.fit_kernels:fit": (
-        "f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], i8, f8, f8, i8, f8, f8, f8"
-    ),
-}
-"""Kernels in the order in which a run needs them, each with the types of its arguments."""
+from dvo.odometry.patch.kernels import KERNELS
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 _MEMORY = 300 * 2**20  # bytes of the process
@@ -97,12 +39,19 @@ def compiled_meanwhile(arguments: argparse.Namespace) -> AbstractContextManager[
     if system is not None or device not in ("auto", "cpu") or os.environ.get("DVO_KERNELS") == "torch":
         return contextlib.nullcontext()
     file = done_file()
-    if file is None or file.exists() or available_cores() < 2:
-        return contextlib.nullcontext()
-    limit = memory_of_group(MEMBERSHIP, CGROUPS)
-    if limit is not None and limit < TRACKING.resident * 2**20 + _MEMORY:
+    if file is None or file.exists() or not room_beside(_MEMORY):
         return contextlib.nullcontext()
     return compiled_by([sys.executable, "-m", "dvo.commands.kernels"])
+
+
+def room_beside(memory: int) -> bool:
+    """Tell if there is a core, and memory, for another process beside one that tracks.
+
+    Args:
+        memory: of that process, bytes.
+    """
+    limit = memory_of_group(MEMBERSHIP, CGROUPS)
+    return available_cores() >= 2 and (limit is None or limit >= TRACKING.resident * 2**20 + memory)
 
 
 def done_file() -> Path | None:

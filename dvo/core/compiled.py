@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba
-from numba.core import event
+from numba.core import event, sigutils
+from numba.core.compiler_lock import global_compiler_lock
 
 from dvo.core import ahead
 
@@ -62,8 +63,24 @@ def compiled(function: F) -> F:
             found = load(*arguments)
         return found
 
-    cache.load_overload = load_or_wait
+    cache.load_overload, cache.load_kept = load_or_wait, load
     return kernel
+
+
+def load_kept(kernel: Any, types: str) -> None:
+    """Load a kernel for arguments of some types if it is on the disk; it is not compiled.
+
+    Args:
+        kernel: of :func:`compiled`.
+        types: of its arguments, as numba writes them.
+    """
+    signature, _ = sigutils.normalize_signature(f"({types},)")
+    load = getattr(kernel._cache, "load_kept", None)  # there is none without a place for the cache
+    with global_compiler_lock:
+        found = None if load is None or signature in kernel.overloads else load(signature, kernel.targetctx)
+        if found is not None:  # as Dispatcher.compile does it
+            kernel.targetctx.insert_user_function(found.entry_point, found.fndesc, [found.library])
+            kernel.add_overload(found)
 
 
 def name_of(function: Callable[..., Any]) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import threading
 from functools import cache
 
 import torch
@@ -24,6 +25,7 @@ from dvo.core.text import print_line
 
 VARIABLE = "DVO_KERNELS"
 CHOICES = ("numba", "torch")
+_IMPORTING = threading.Lock()
 
 
 def use_kernels(*tensors: Tensor, double: bool = False, adjoint: bool = False) -> bool:
@@ -110,8 +112,13 @@ def _chosen() -> str:
     return chosen
 
 
-@cache
 def _imported() -> bool:
+    with _IMPORTING:  # a line of two threads would be two
+        return _import()
+
+
+@cache
+def _import() -> bool:
     try:
         importlib.import_module("numba")
     except ImportError as error:  # also a numba that does not know this numpy

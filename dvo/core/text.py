@@ -154,6 +154,9 @@ def _values(before: str, blank: str) -> re.Pattern[str]:
 _VALUES = {whole: (_values("?&", blank), _values("?&;#/_", blank)) for whole, blank in ((False, r"\s"), (True, ""))}
 
 
+_NO_BYTES = re.compile("[\ud800-\udc7f\udd00-\udfff]")
+
+
 def in_utf8(text: str) -> str:
     """Text that can be written in UTF-8: bytes of a file's name that are no text become U+FFFD.
 
@@ -169,7 +172,7 @@ def in_utf8(text: str) -> str:
 
 def _is_escaped(text: str) -> bool:
     """True unless there are surrogates that stand for no byte."""
-    return not any("\ud800" <= c <= "\udfff" and not "\udc80" <= c <= "\udcff" for c in text)
+    return _NO_BYTES.search(text) is None
 
 
 def visible(text: str, *, lines: bool = False) -> str:

@@ -113,17 +113,18 @@ class SyntheticSequence:
         """
         return float(self.groundtruth.timestamps[index])
 
-    def rendering(self, index: int) -> Rendering:
+    def rendering(self, index: int, *, coordinates: bool = True) -> Rendering:
         """Clean image, depth, surfaces and texture coordinates of one frame (batch of 1).
 
         Args:
             index: of the frame.
+            coordinates: fill the texture coordinates too.
 
         Returns:
             Batch of one.
         """
         shot = replace(self.shot, camera=self._cropped(index))
-        return shot.rendering(self.time(index), self.groundtruth.poses_wc[index : index + 1])
+        return shot.rendering(self.time(index), self.groundtruth.poses_wc[index : index + 1], coordinates)
 
     def _cropped(self, index: int) -> Camera:
         """Camera with its principal point where the crop of a stabilised video has it."""
@@ -148,7 +149,7 @@ class SyntheticSequence:
         if self.sensor is not None and bool(self.sensor.dark(self.groundtruth.timestamps[index : index + 1])[0]):
             images = torch.zeros(1, 3, self.camera.height, self.camera.width)  # whatever is there, it is not seen
         else:
-            rendered = self.rendering(index)
+            rendered = self.rendering(index, coordinates=False)
             images = self._covered(index, rendered)[0] if self.surroundings else rendered.images
         if self.sensor is not None:
             rng = np.random.default_rng([self.seed, salts.NOISE, index])

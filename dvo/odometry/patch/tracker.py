@@ -41,6 +41,7 @@ from dvo.odometry.patch.finishing import finish_segments, judge_result, run_info
 from dvo.odometry.patch.inertial import InertialTracking
 from dvo.odometry.patch.initial_pose import first_depth, first_pose
 from dvo.odometry.patch.initialisation import NOT_INITIALISED, first_motion, initialise_related, leave_minimum
+from dvo.odometry.patch.kernels import load_in_background
 from dvo.odometry.patch.loops import loop_closer
 from dvo.odometry.patch.new_recording import begin_in_map
 from dvo.odometry.patch.retry import retry_waiting
@@ -101,6 +102,8 @@ class PatchOdometry:
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
         self.archive = archive
+        if self.device.type == "cpu":
+            load_in_background()
         self.reset()
 
     def reset(self) -> None:

@@ -124,12 +124,13 @@ class Shot:
         """
         return replace(self, path=Offset(self.path, np.array([baseline, 0, 0, 0, 0, 0, 1.0])))
 
-    def sharp(self, time: float, pose_wc: Array | None = None) -> Rendering:
+    def sharp(self, time: float, pose_wc: Array | None = None, coordinates: bool = True) -> Rendering:
         """Image frozen in the middle of the exposure.
 
         Args:
             time: seconds.
             pose_wc: ``(1, 7)`` saves evaluating the path.
+            coordinates: fill ``uv`` too.
 
         Returns:
             Batch of one.
@@ -139,11 +140,11 @@ class Shot:
             poses = self.path.poses_wc(when)
             return render_rows(
                 self.scene, poses, self.camera.intrinsics, self.camera.width, times=when,
-                quality=Quality(self.supersample), device=self.device,
+                quality=Quality(self.supersample), device=self.device, coordinates=coordinates,
             )  # fmt: skip
         when = np.array([time])
         pose = self.path.poses_wc(when) if pose_wc is None else pose_wc
-        return self._render(pose, when, self.supersample)
+        return self._render(pose, when, self.supersample, coordinates)
 
     def _render(self, poses_wc: Array, when: Array, supersample: int = 1, coordinates: bool = True) -> Rendering:
         """Sharp frames ``(N, ...)`` with a global shutter."""
@@ -157,17 +158,18 @@ class Shot:
             device=self.device, coordinates=coordinates,
         )  # fmt: skip
 
-    def rendering(self, time: float, pose_wc: Array | None = None) -> Rendering:
+    def rendering(self, time: float, pose_wc: Array | None = None, coordinates: bool = True) -> Rendering:
         """Clean image, with motion blur if the exposure lasts.
 
         Args:
             time: seconds.
             pose_wc: ``(1, 7)`` saves evaluating the path.
+            coordinates: fill ``uv`` too.
 
         Returns:
             Batch of one.
         """
-        middle = self.sharp(time, pose_wc)
+        middle = self.sharp(time, pose_wc, coordinates)
         if self.exposure <= 0:
             return middle
         count = self.sub_exposures(middle, time)

@@ -110,11 +110,14 @@ def _tried(step: Callable[..., Any]) -> Callable[..., Any]:
 def part(function: F) -> F:
     """Compile a function that only compiled ones of its file call; it costs half the time, and no file of its own.
 
+    It becomes a piece of each that calls it. One that is called instead has a copy in each of them, and where several
+    are in memory the first copy serves all: then the sums of a kernel would depend on which others are there.
+
     Args:
         function: see :func:`compiled`.
 
     Returns:
         The same, compiled.
     """
-    options: dict[str, Any] = dict(_OPTIONS, no_cpython_wrapper=True)
+    options: dict[str, Any] = dict(_OPTIONS, no_cpython_wrapper=True, forceinline=True)
     return numba.njit(**options)(function)

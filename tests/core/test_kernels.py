@@ -30,6 +30,17 @@ def total(x):
 
 print(total(np.ones(1000)), total(np.array([1.0, np.nan])))
 """
+ALIGN = """
+import hashlib, numpy as np
+from dvo.nets.alignment.alignment_kernels import align
+
+random = np.random.default_rng(0)
+images, places = random.random((2, 40, 50), np.float32), (random.random((2, 99, 2)) * 30 + 5).astype(np.float32)
+edges, warps = np.zeros(99, np.int64), np.tile(np.eye(2, dtype=np.float32), (99, 1, 1))
+found, quality = np.empty((99, 2), np.float32), np.empty((2, 99), np.float32)
+align(images, edges, edges + 1, *places, warps, 7, 5, 1e-3, 2.0, found, quality)
+print(hashlib.sha1(found.tobytes() + quality.tobytes()).hexdigest(), len(align.stats.cache_hits))
+"""
 
 
 def test_of_the_cpu_without_gradients(monkeypatch):
@@ -84,6 +95,18 @@ def test_compiled_once_with_a_line(tmp_path):
                                text=True, check=True)  # fmt: skip
         assert found.stdout.strip() == "1000.0 nan"
         assert found.stderr.count("compiling kernels") == said
+
+
+@pytest.mark.long
+def test_compiled_or_from_the_disk_the_last_bits_are_the_same(tmp_path):
+    environment = {"PYTHONPATH": str(ROOT), "PATH": "", "NUMBA_CACHE_DIR": str(tmp_path)}
+
+    def run():
+        line = [sys.executable, "-c", ALIGN]
+        return subprocess.run(line, env=environment, capture_output=True, text=True, check=True).stdout.split()
+
+    (compiled, hits), (kept, later) = run(), run()
+    assert compiled == kept and (hits, later) == ("0", "1")
 
 
 @pytest.mark.long

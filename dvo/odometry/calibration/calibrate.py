@@ -10,11 +10,12 @@ unless the measurements tell it closely.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, tee
+from operator import length_hint
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -153,7 +154,8 @@ def calibrate(
 
     focal, aside, wanted, reason, count = guess.focal, (0.0, 0.0), options.frames, "", 0
     walk: list[tuple[float, float]] = []
-    length = _length(frames)
+    known = length_hint(frames, -1)  # a source may not know it before it is read
+    length = known if known >= 0 else None
     left = math.inf if length is None else length + options.spare
     tracking: _Tracking | None = None
     for number in range(options.rounds):
@@ -188,12 +190,6 @@ def calibrate(
         if is_settled or is_last:
             return result(focal, deviation * focal, SELF_CALIBRATED, count, "", guess, aside, unsure)
     return result(guess.focal, guess.deviation, guess.source, count, reason, guess)
-
-
-def _length(frames: Iterable[Frame]) -> int | None:
-    """Number of frames; None if it is not known before they are read."""
-    count: int | None = getattr(frames, "frame_count", None)
-    return len(frames) if count is None and isinstance(frames, Sized) else count
 
 
 def _readable(frames: Iterable[Frame]) -> Iterator[Frame]:

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -233,6 +234,20 @@ def test_frames_that_cannot_be_read_end_the_estimate_only(clip):
     assert calibrate(Broken(), options=options) == calibrate(clip[:6], options=options)
     calibrate(live(), options=replace(options, frames=3), on_frame=lambda frame, estimate: None)
     assert len(read) < len(clip), "an iterator is read as far as needed"
+
+
+def test_a_source_whose_length_is_not_known(clip, tmp_path):
+    """One that ends at a time, for example."""
+    video, options, seen = tmp_path / "video.avi", CalibrationOptions(rounds=1), []
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 30, (192, 144))
+    for frame in clip[:12]:
+        writer.write(frame.image)
+    writer.release()
+    source = dvo.open(video, guess=True, end=0.19)
+    with pytest.raises(TypeError, match="not known"):
+        len(source)
+    calibrate(source, options=options, on_frame=lambda frame, estimate: seen.append(frame.index))
+    assert seen == list(range(6))
 
 
 def test_it_is_part_of_the_public_interface():

@@ -37,7 +37,7 @@ MOST_JUMPS = 2
 """Jumps in a hundred frames."""
 
 MASK = "mask what moves or is fixed to the camera (--mask), or film so that most of the picture stands still"
-CALIBRATE = "check the calibration (dvo calibrate), or run without --calib"
+CALIBRATE = "give a calibration of this camera and this resolution (--calib FILE; dvo calibrate makes one)"
 FILM = "film textured surfaces at a few metres while the camera moves sideways, or use --preset accurate"
 STEADY = "turn electronic stabilisation off"
 MOVE = "move the camera sideways while filming; a tripod or a single picture has no trajectory"

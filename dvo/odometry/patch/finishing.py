@@ -71,7 +71,7 @@ def judge_result(
     step, sure = profile.minimum.value, profile.contrast >= SURE_CONTRAST
     if not (sure and abs(step) > WRONG_FOCAL):
         return quality
-    reason = f"the measurements fit a focal length {math.exp(step):.2f} times the one that is given"
+    reason = f"the measurements fit a focal length {math.exp(step):.2f} times the one that is used"
     return replace(quality, verdict="doubtful", reason=reason, remedy=CALIBRATE)
 
 

@@ -33,6 +33,9 @@ WRONG_FOCAL = 0.12
 """Logarithm of the focal length that the measurements ask for over the one that is given."""
 FEWEST_CHECKS = 3
 """Pairs of images with followed corners that a verdict needs."""
+MOST_STILL = 1 / 3
+"""Share of the frames through which corners hardly move though the poses do: cars ahead, reflections or a bonnet are
+most of what is seen, and little holds the scale."""
 MOST_JUMPS = 2
 """Jumps in a hundred frames."""
 
@@ -62,6 +65,7 @@ class Quality:
         check: share of these corners within a pixel of the lines; NaN without pairs.
         crop: share of the cost of the corners of a pair that a shift of the image explains, median; NaN with few pairs.
         checks: number of pairs of images with followed corners.
+        still: share of the frames through which followed corners hardly move though the poses do.
         jumps: number of frames between which the camera moved far more than before and after.
         fixed: share of the image that is fixed to the camera, is in no mask that was given, and was left out.
         second: difference of a second run, backward with another seed, percent of the path; NaN if there was none.
@@ -86,6 +90,7 @@ class Quality:
     check: float = float("nan")
     crop: float = float("nan")
     checks: int = 0
+    still: float = 0.0
     jumps: int = 0
     fixed: float = 0.0
     second: float = float("nan")
@@ -145,6 +150,8 @@ def judge(quality: Quality, frames: int, cause: str = "") -> tuple[Verdict, str,
         return "doubtful", f"the measurements contradict each other ({share})", CALIBRATE
     if quality.checks < FEWEST_CHECKS:
         return "doubtful", "too little of the picture moves to check the poses by", FILM
+    if quality.still > MOST_STILL:
+        return "doubtful", f"too little of the picture moves for {quality.still:.0%} of the time", FILM
     if quality.fixed > MOST_FIXED:
         return "doubtful", f"{quality.fixed:.0%} of the picture are fixed to the camera; found only after a while", MASK
     if quality.tracked < LEAST_TRACKED:

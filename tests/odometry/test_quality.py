@@ -82,6 +82,21 @@ def test_standing_still_after_the_start_is_good(film):
     assert result.frames_lost == 0 and result.quality.verdict == "good"
 
 
+@pytest.mark.long
+def test_the_share_of_the_frames_through_which_corners_hardly_move(film):
+    """The camera stands from frame 20 on: what is seen then does not count."""
+    frames = [*film[:20], *(replace(frame, image=film[19].image) for frame in film[20:])]
+    for still, share in ([(20, 35)], 0.0), ([(8, 14), (20, 35)], 6 / 12), ([(8, 20), (20, 35)], 12 / 12):
+        odometry = dvo.load("small", device="cpu", seed=0)
+        for frame in frames:
+            odometry.track(frame)
+        checks = odometry.state.checks
+        pair = checks.pairs[0]
+        checks.pairs = [replace(pair, first=14, second=20)] if still[0] != (8, 20) else []
+        checks.still = still
+        assert odometry.finish().quality.still == pytest.approx(share)
+
+
 @pytest.mark.parametrize(
     ("changed", "verdict", "words"),
     [
@@ -93,6 +108,8 @@ def test_standing_still_after_the_start_is_good(film):
         ({"deviation": float("nan"), "checks": 0}, "doubtful", "too little of the picture moves"),
         ({"agreement": LEAST_AGREEMENT - 0.01}, "doubtful", "contradict each other"),
         ({"agreement": float("nan")}, "doubtful", "there are none"),
+        ({"still": 0.3}, "good", ""),
+        ({"still": 0.4}, "doubtful", "too little of the picture moves for 40% of the time"),
         ({"fixed": 0.3}, "doubtful", "30% of the picture"),
         ({"tracked": 0.3}, "doubtful", "30% of the frames"),
         ({"jumps": 3}, "doubtful", "jumps 3 times"),

@@ -50,10 +50,12 @@ class CheckPairs:
 
     Attributes:
         pairs: so far, in order of time.
+        still: numbers of the first and the last of the frames through which the corners hardly moved.
     """
 
     def __init__(self) -> None:
         self.pairs: list[CheckPair] = []
+        self.still: list[tuple[int, int]] = []
         self._gap, self._pause = GAPS[0], 0
         self._first: tuple[int, np.ndarray] | None = None
         self._next = 0
@@ -78,13 +80,16 @@ class CheckPairs:
             if len(points) >= MIN_CORNERS and moved < DISPLACEMENTS[0] and number < first + GAPS[1]:
                 self._next = number + self._gap
                 return
-            if len(points) >= MIN_CORNERS and moved >= DISPLACEMENTS[0]:
-                self.pairs.append(CheckPair(first, number, points, np.asarray(intrinsics, np.float64)))
+            if len(points) >= MIN_CORNERS:
+                if moved >= DISPLACEMENTS[0]:
+                    self.pairs.append(CheckPair(first, number, points, np.asarray(intrinsics, np.float64)))
+                else:
+                    self.still.append((first, number))
                 pause = self._pause
             shorter, longer = len(points) < MIN_CORNERS or moved > DISPLACEMENTS[2], moved < DISPLACEMENTS[1]
             self._gap = max(self._gap // 2, 1) if shorter else min(2 * self._gap, GAPS[1]) if longer else self._gap
-        if len(self.pairs) > MAX_PAIRS:
-            self.pairs, self._pause = self.pairs[::2], 2 * self._pause + self._gap
+        if len(self.pairs) + len(self.still) > MAX_PAIRS:
+            self.pairs, self.still, self._pause = self.pairs[::2], self.still[::2], 2 * self._pause + self._gap
         self._first, self._next = (None, number + pause) if pause else ((number, grey), number + self._gap)
 
 

@@ -27,6 +27,8 @@ NEAR_LINE = 1.0
 """Distance of a corner from its epipolar line that agrees, pixels."""
 ROLLING_SHARE = 0.5
 """Share that counts of what shifts explain under a rolling shutter, whose correction for corners is approximate."""
+STANDING = 0.1
+"""Speed over the median one below which a camera stands."""
 JUMP = 6.0
 """Length of a step over the longer one of the steps before and after, and over the median, of a jump."""
 
@@ -75,7 +77,7 @@ def measure_quality(
         quality = replace(
             quality, inliers=float(total[2] / total[0]), agreement=agreement, residual=residual, spread=longest[2]
         )
-    placed = list(_placed(graph, checks))
+    placed = list(_placed(graph, checks.pairs))
     pairs = [(epipolar_distances(pair, *poses), median_displacement(pair.points)) for pair, *poses in placed]
     if pairs:
         distances = np.concatenate([away for away, _ in pairs])
@@ -83,6 +85,7 @@ def measure_quality(
         agreed = float((distances < NEAR_LINE).mean())
         quality = replace(quality, checks=len(pairs), deviation=deviation, check=agreed)
         quality = replace(quality, crop=_shift_gain(graph, placed, shutter, stride))
+    quality = replace(quality, still=_still(graph, checks))
     verdict, reason, remedy = judge(quality, result.frames_read, cause)
     return replace(quality, verdict=verdict, reason=reason, remedy=remedy)
 
@@ -111,15 +114,42 @@ def _inliers(graph: Map, segment: int, shutter: Shutter) -> tuple[np.ndarray, np
     return counts, residual[confident].numpy(), float(spread)
 
 
-def _placed(graph: Map, checks: CheckPairs) -> Iterator[_Placed]:
+def _placed(graph: Map, pairs: Sequence[CheckPair]) -> Iterator[_Placed]:
     """Pairs whose frames have poses in one world, with these, ``T_cw``."""
-    log, pose = graph.log, cache(graph.log.pose)
-    for pair in checks.pairs:
-        frames = [log.frames[number] for number in (pair.first, pair.second)]
+    pose = cache(graph.log.pose)
+    for pair in pairs:
         first, second = (pose(number) for number in (pair.first, pair.second))
-        same = graph.world_of(frames[0].segment) == graph.world_of(frames[1].segment)
-        if not any(frame.lost for frame in frames) and same and first is not None and second is not None:
+        if _world(graph, pair.first, pair.second) is not None and first is not None and second is not None:
             yield pair, first, second
+
+
+def _world(graph: Map, *numbers: int) -> int | None:
+    """World of frames; None if one is lost, or they are of several."""
+    frames = [graph.log.frames[number] for number in numbers]
+    worlds = {graph.world_of(frame.segment) for frame in frames}
+    return worlds.pop() if len(worlds) == 1 and not any(frame.lost for frame in frames) else None
+
+
+def _still(graph: Map, checks: CheckPairs) -> float:
+    """Share of the frames of the checks through which corners hardly move though the poses do."""
+    spans = [(pair.first, pair.second, False) for pair in checks.pairs] + [(*span, True) for span in checks.still]
+    pose, found = cache(graph.log.pose), dict[int, list[tuple[float, int, bool]]]()
+    for first, second, still in spans:
+        world, start, end = _world(graph, first, second), pose(first), pose(second)
+        if world is not None and start is not None and end is not None:
+            speed = float(np.linalg.norm(_centre(end) - _centre(start))) / (second - first)
+            found.setdefault(world, []).append((speed, second - first, still))
+    counts = np.zeros(2)
+    for looks in found.values():
+        speeds, frames, still = np.array(looks).T
+        moving = speeds > STANDING * np.median(speeds)
+        counts += (frames[moving] @ still[moving], frames[moving].sum())
+    return float(counts[0] / max(counts[1], 1))
+
+
+def _centre(pose_cw: np.ndarray) -> np.ndarray:
+    """Centre of a camera in the world."""
+    return se3.inverse(torch.as_tensor(pose_cw, dtype=torch.float64))[:3].numpy()
 
 
 def _shift_gain(graph: Map, placed: Sequence[_Placed], shutter: Shutter, stride: int) -> float:

@@ -37,10 +37,14 @@ def film(wall, count, step):
 
 
 def pairs_of(images, mask=None):
+    return checks_of(images, mask).pairs
+
+
+def checks_of(images, mask=None):
     checks = CheckPairs()
     for number, image in enumerate(images):
         checks.see(number, image, K, mask)
-    return checks.pairs
+    return checks
 
 
 def test_corners_move_as_the_picture_does(wall):
@@ -63,16 +67,31 @@ def test_the_gap_follows_the_motion(wall):
         assert pair.second - pair.first <= GAPS[1]
 
 
+def test_frames_through_which_corners_hardly_move_are_kept(wall):
+    checks = checks_of(film(wall, 80, 0.02))
+    assert not checks.pairs and len(checks.still) == 2
+    (first, middle), (start, last) = checks.still
+    assert first == 0 and middle == start and GAPS[1] <= middle <= 2 * GAPS[1] and start < last < 80
+    assert not checks_of(film(wall, 60, 0.6)).still
+
+
 def test_what_cannot_be_followed_gives_no_pair():
     rng = np.random.default_rng(0)
-    assert not pairs_of([rng.integers(0, 255, (120, 160, 3), np.uint8) for _ in range(12)])
-    assert not pairs_of([np.full((120, 160, 3), 90, np.uint8)] * 12)
+    noise, grey = (
+        (rng.integers(0, 255, (120, 160, 3), np.uint8) for _ in range(12)),
+        np.full((120, 160, 3), 90, np.uint8),
+    )
+    for images in (noise, [grey] * 50):
+        checks = checks_of(images)
+        assert not checks.pairs and not checks.still
 
 
 def test_a_long_sequence_keeps_a_bounded_number(wall, monkeypatch):
     monkeypatch.setattr("dvo.odometry.checks.check_pairs.MAX_PAIRS", 8)
     pairs = pairs_of(film(wall, 250, 3))
     assert MAX_PAIRS > 8 >= len(pairs) >= 4 and pairs[0].first < 20 and pairs[-1].second > 180
+    still = checks_of(film(wall, 900, 0)).still
+    assert 8 >= len(still) >= 3 and still[0][0] == 0 and still[-1][1] > 600
 
 
 @given(st.lists(st.floats(-0.15, 0.15), min_size=12, max_size=12), st.integers(0, 10_000))

@@ -136,7 +136,7 @@ def make_laps(count: int, lap: int = 500, every: int = 5, seed: int = 0) -> Grap
     zero = torch.zeros_like(angle)
     centre = torch.stack((10 * angle.sin(), 0.001 * torch.arange(count), 10 * angle.cos()), -1)
     true = sim3.from_se3(se3.inverse(torch.cat((centre, so3.exp(torch.stack((zero, angle, zero), -1))), -1)))
-    loops = torch.arange(lap, count, every)
+    loops = torch.arange(min(lap, count), count, every)
     ii = torch.cat((torch.arange(count - 1), loops - lap))
     jj = torch.cat((torch.arange(1, count), loops))
     sigma = torch.tensor([2e-3] * 3 + [1e-3] * 3 + [2e-3], dtype=torch.float64)

@@ -82,14 +82,23 @@ def test_the_ci_runs_the_test_command():
     assert re.search(r"^pip install -e .* && pytest", README.read_text(encoding="utf-8"), re.MULTILINE)
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/architecture.md"])
-def test_rooms_named_are_the_rooms_there(page):
-    """The tree in the text lists every folder of the library, and no other."""
-    text = (README.parent / page).read_text(encoding="utf-8")
+def rooms_there() -> set[str]:
+    return {path.parent.name for path in (README.parent / "dvo").glob("*/__init__.py")}
+
+
+def test_rooms_named_are_the_rooms_there():
+    """The tree on the page lists every folder of the library, and no other."""
+    text = (README.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
     tree = text[text.index("    dvo/ ") : text.index("      viz/")].splitlines()[1:]
     named = {found.group(1) for line in tree if (found := re.match(r"      (\w+)/ ", line))} | {"viz"}
-    there = {path.parent.name for path in (README.parent / "dvo").glob("*/__init__.py")}
-    assert named | {"commands"} == there
+    assert named | {"commands"} == rooms_there()
+
+
+def test_the_box_has_the_rooms():
+    text = README.read_text(encoding="utf-8")
+    box = text[text.index("    core  geometry") : text.index("    eval/")].splitlines()
+    named = {name for line in box for name in re.split(r"\s{2,}", line.strip())[:-1]}
+    assert named == rooms_there() | {"train/"}
 
 
 @pytest.mark.parametrize("top", ["train", "eval"])

@@ -66,6 +66,15 @@ def test_pictures_are_small_and_those_of_their_script(folder, page, names):
     assert all(f"({folder}/{picture.name})" in text for picture in pictures)
 
 
+@pytest.mark.long
+def test_script_of_the_rooms_draws_them(tmp_path, monkeypatch):
+    script = runpy.run_path(str(DOCS / "rooms" / "make.py"))
+    monkeypatch.setattr(sys, "argv", ["make.py", "--out", str(tmp_path / "rooms.png")])
+    script["main"]()
+    drawn, kept = (cv2.imread(str(path)) for path in (tmp_path / "rooms.png", DOCS / "rooms" / "rooms.png"))
+    assert drawn.shape == kept.shape and drawn.std() > 10
+
+
 @pytest.mark.slow
 def test_script_of_the_figures_draws_them(tmp_path, monkeypatch):
     """Of the first frames of the walk, on which the window has just been initialised."""

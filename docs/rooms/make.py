@@ -1,7 +1,8 @@
 """Picture of docs/architecture.md: the rooms of dvo, by their imports: python docs/rooms/make.py [--out FILE].
 
 A room stands above all that it imports; its number is that of its lines. An arrow is an import that does not follow
-from others: who imports `nets` may import `geometry` too. `core` is left out, which everybody imports.
+from others: who imports `nets` may import `geometry` too. `core` is left out, which everybody imports, and what only
+starts the command line.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any
 FOLDER = Path(__file__).resolve().parent
 LIBRARY = FOLDER.parents[1] / "dvo"
 INNER = ("data", "odometry")
-EVERYWHERE = {"core", "moved", "__init__", "__main__"}
+LEFT_OUT = {"core", "moved", "__init__", "__main__", "batch_worker"}
 WIDTH, HEIGHT, GAP = 2.3, 0.62, 0.5
 
 
@@ -67,7 +68,7 @@ def floors(taken: dict[str, set[str]]) -> list[list[str]]:
 def top_room(file: Path) -> str | None:
     """Room of a file in the whole library."""
     place = file.relative_to(LIBRARY).parts[0].removesuffix(".py")
-    return None if place in EVERYWHERE else place
+    return None if place in LEFT_OUT else place
 
 
 def inner_room(room: str) -> Callable[[Path], str | None]:

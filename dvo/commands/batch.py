@@ -272,7 +272,7 @@ def _track(
         ray = None if arguments.ray is None else stack.enter_context(cluster.connected(arguments.ray, ROOT))
         if ray is None:
             processes.begin()
-        switch = stack.enter_context(InterruptSwitch())  # after Ray, which has a handler of its own
+        switch = stack.enter_context(InterruptSwitch(patience=4.0))  # after Ray, which has a handler of its own
         if ray is None:
             switch.on_press = lambda: processes.close(switch.pressed or signal.SIGTERM)
             found = _in_processes(jobs, out, workers)
@@ -331,7 +331,7 @@ def run_one(job: Job, folder: Path, log: Path) -> Ending:
     environment = process_environment(job.threads, {**os.environ, "PYTHONPATH": path})
     begin = f"{LOG_BEGIN}{job.threads} dvo {visible(shlex.join(line))}\n"
     log.write_text(begin, encoding="utf-8", errors="replace")
-    program = [sys.executable, "-m", "dvo.commands.batch_worker", str(os.getpid())]
+    program = [sys.executable, "-m", "dvo.batch_worker", str(os.getpid())]
     return run_limited([*program, *line], environment, None, log)
 
 

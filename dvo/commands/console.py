@@ -125,13 +125,15 @@ class InterruptSwitch:
 
     Args:
         on_press: called at the first signal, in its handler.
+        patience: multiple of :data:`GRACE`, above 1 for a program that waits for others which have that time.
 
     Attributes:
         pressed: the first signal, None before it.
     """
 
-    def __init__(self, on_press: Callable[[], object] | None = None) -> None:
+    def __init__(self, on_press: Callable[[], object] | None = None, patience: float = 1.0) -> None:
         self.on_press = on_press
+        self._patience = patience
         self.pressed: signal.Signals | None = None
         self._before: dict[signal.Signals, Any] = {}
         self._limited = hasattr(signal, "setitimer")
@@ -167,7 +169,7 @@ class InterruptSwitch:
             raise KeyboardInterrupt if number == signal.SIGINT else Terminated(number)
         self.pressed = signal.Signals(number)
         if self.in_haste and self._limited:
-            signal.setitimer(signal.ITIMER_REAL, GRACE)
+            signal.setitimer(signal.ITIMER_REAL, self._patience * GRACE)
         if self.on_press is not None:
             self.on_press()
 

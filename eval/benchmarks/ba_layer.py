@@ -24,7 +24,9 @@ from dvo.ba.edges import plan_edges
 from dvo.ba.layer.layer import bundle_adjust
 from dvo.ba.layer.reference import bundle_adjust_reference
 from dvo.ba.options import BAOptions
+from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.points import residuals, solve_points
+from dvo.ba.solve import solve
 from dvo.core.command_line import OneLineParser
 from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.geometry import se3, so3
@@ -82,19 +84,20 @@ def fastest(run: Callable[[], None], device: torch.device, repeats: int) -> floa
     return best * 1e3
 
 
-def window(edges: int, frames: int = 9, per_frame: int = 24) -> list[Tensor]:
-    """Input of ``bundle_adjust`` as in tracking.
+def window(edges: int, frames: int = 9, per_frame: int = 24) -> PatchProblem:
+    """A problem as in tracking.
 
     Args:
         edges: number of edges.
         frames, per_frame: numbers of frames, and of patches per frame.
 
     Returns:
-        The arguments, of a batch of one.
+        The problem, a batch of one.
     """
     floats, indices = training_clip(1, frames, per_frame, torch.device("cpu"))
-    a, b, c, targets, weights = floats
-    return [a, b, c, targets[:, :edges], weights[:, :edges], *(x[:edges] for x in indices)]
+    poses_cw, patches, intrinsics, targets, weights = floats
+    ii, jj, kk = (x[:edges] for x in indices)
+    return PatchProblem(poses_cw, patches, intrinsics, targets[:, :edges], weights[:, :edges], ii, jj, kk)
 
 
 def kernels_and_twin(edges: int, repeats: int) -> tuple[float, float]:
@@ -114,7 +117,7 @@ def kernels_and_twin(edges: int, repeats: int) -> tuple[float, float]:
             for choice in CHOICES:
                 os.environ[VARIABLE] = choice
                 start = time.perf_counter()
-                bundle_adjust(*given, BAOptions(check=False, bounds=(160, 120)))  # type: ignore[misc]
+                solve(given, BAOptions(check=False, bounds=(160, 120)))
                 best[choice] = min(best[choice], time.perf_counter() - start)
     os.environ.pop(VARIABLE)
     if chosen is not None:

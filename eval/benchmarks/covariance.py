@@ -26,6 +26,7 @@ import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -150,7 +151,7 @@ def measure(
         DvoError: no such weights, or those of a network without patches.
     """
     metric = scale != "none"
-    options = {"scale": {scale: True}} if metric else {}
+    options: dict[str, Any] = {"scale": {scale: True}} if metric else {}
     odometry = load(weights, seed=seed, final_adjustment=False, loops=False, **options)
     if not isinstance(odometry, PatchOdometry):
         raise DvoError("has no covariances", file=weights, field="--weights", remedy="give weights of a patch network")

@@ -8,6 +8,8 @@ measurements that are aligned before it.
 
 from __future__ import annotations
 
+from typing import Any
+
 from dvo.core.command_line import OneLineParser
 from dvo.core.threads import settle_threads
 from dvo.metrics import Metrics, evaluate
@@ -15,7 +17,7 @@ from dvo.odometry.load import load
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from eval.suites.suite import read_suites
 
-CASES = {
+CASES: dict[str, dict[str, Any]] = {
     "network": {"align": "none", "final_adjustment": False},
     "network, adjusted": {"align": "none"},
     "network, aligned, adjusted": {"align": "final"},

@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 import resource
 import time
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
-from dvo.ba.sparse.global_adjust import GlobalBAOptions, global_bundle_adjust
+from dvo.ba.patch_problem import PatchProblem
+from dvo.ba.solve import solve
+from dvo.ba.sparse.global_adjust import GlobalBAOptions
 from dvo.ba.sparse.levenberg import LMOptions
 from dvo.core.command_line import OneLineParser
 from dvo.geometry import se3, so3
@@ -24,39 +25,6 @@ from dvo.geometry.projection import reproject
 
 WIDTH, HEIGHT, FOCAL = 320.0, 240.0, 260.0
 RADIUS = 10.0
-
-
-@dataclass(frozen=True)
-class Graph:
-    """Arguments of :func:`dvo.ba.sparse.global_adjust.global_bundle_adjust`, and the true poses.
-
-    Attributes:
-        poses_cw: ``(N, 7)`` initial world-to-camera poses.
-        patches: ``(K, 3, 1, 1)`` x, y (pixels), initial inverse depth (1/m).
-        intrinsics: ``(N, 4)`` fx fy cx cy, pixels.
-        targets: ``(E, 2)`` measured positions, pixels.
-        weights: ``(E, 2)``.
-        ii, jj, kk: ``(E,)`` source frame, target frame and patch.
-        true_poses_cw: ``(N, 7)``.
-    """
-
-    poses_cw: Tensor
-    patches: Tensor
-    intrinsics: Tensor
-    targets: Tensor
-    weights: Tensor
-    ii: Tensor
-    jj: Tensor
-    kk: Tensor
-    true_poses_cw: Tensor
-
-    def arguments(self) -> tuple[Tensor, ...]:
-        """Positional arguments of :func:`dvo.ba.sparse.global_adjust.global_bundle_adjust`.
-
-        Returns:
-            Poses, patches, intrinsics, targets, weights, ii, jj, kk.
-        """
-        return (self.poses_cw, self.patches, self.intrinsics, self.targets, self.weights, self.ii, self.jj, self.kk)
 
 
 def make_graph(
@@ -68,7 +36,7 @@ def make_graph(
     wrong: float = 0.03,
     seed: int = 0,
     dtype: torch.dtype = torch.float64,
-) -> Graph:
+) -> tuple[PatchProblem, Tensor]:
     """Two laps of a circle with the camera facing outwards.
 
     Args:
@@ -82,7 +50,7 @@ def make_graph(
         dtype: of all tensors.
 
     Returns:
-        The problem, with a drifting initial estimate.
+        The problem, with a drifting initial estimate, and the true poses ``(N, 7)``, world to camera.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -134,7 +102,9 @@ def make_graph(
     rough[:, 2] *= 1 + 0.2 * (2 * rand(len(rough), 1, 1) - 1)
     weights = 0.5 + 0.5 * rand(len(target), 2)
     floats = (se3.normalise(torch.stack(start)), rough, intrinsics, target, weights)
-    return Graph(*(x.to(dtype) for x in floats), ii[which], jj[which], kk[which], true.to(dtype))
+    poses_cw, rough, intrinsics, target, weights = (x.to(dtype) for x in floats)
+    edges = ii[which], jj[which], kk[which]
+    return PatchProblem(poses_cw, rough, intrinsics, target, weights, *edges), true.to(dtype)
 
 
 def position_error(poses_cw: Tensor, true_poses_cw: Tensor) -> float:
@@ -163,19 +133,20 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=20)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    graph = make_graph(arguments.frames, arguments.patches, dtype=torch.float32 if arguments.float32 else torch.float64)
+    dtype = torch.float32 if arguments.float32 else torch.float64
+    problem, true_poses_cw = make_graph(arguments.frames, arguments.patches, dtype=dtype)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     options = GlobalBAOptions(
         kernel=Kernel("huber", 1.0),
         solver=LMOptions(max_iterations=arguments.iterations, tolerance=1e-4, solver=arguments.solver),
     )
     wall, processor = time.perf_counter(), time.process_time()
-    result = global_bundle_adjust(*graph.arguments(), options=options)
+    result = solve(problem, options)
     wall, processor = time.perf_counter() - wall, time.process_time() - processor
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    error = [position_error(x, graph.true_poses_cw) for x in (graph.poses_cw, result.poses_cw)]
-    print(f"frames {arguments.frames}, patches {len(graph.patches)}, edges {len(graph.ii)}")
-    print(f"stored blocks {result.stored_blocks} ({result.stored_blocks / len(graph.ii):.2f} an edge)")
+    error = [position_error(x, true_poses_cw) for x in (problem.poses_cw, result.poses_cw)]
+    print(f"frames {arguments.frames}, patches {len(problem.patches)}, edges {len(problem.ii)}")
+    print(f"stored blocks {result.stored_blocks} ({result.stored_blocks / len(problem.ii):.2f} an edge)")
     print(f"{wall:.1f} s wall, {processor:.1f} s of processor, {arguments.threads} threads")
     print(f"{result.iterations} iterations, converged: {result.converged}")
     print(f"peak memory of the process {peak / 1024:.0f} MB, {before / 1024:.0f} MB before the call")

@@ -17,7 +17,9 @@ import torch
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
-from dvo.ba.layer.layer import BAOptions, bundle_adjust
+from dvo.ba.options import BAOptions
+from dvo.ba.patch_problem import PatchProblem
+from dvo.ba.solve import solve
 from dvo.core.command_line import OneLineParser
 from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.nets.alignment.alignment import align_patches
@@ -58,8 +60,8 @@ def alignment(generator: torch.Generator, device: torch.device) -> tuple[str, Ca
     centres = torch.rand(edges, 2, generator=generator) * torch.tensor([width, height])
     start = centres + torch.rand(edges, 2, generator=generator)
     warps = torch.eye(2) + 0.1 * torch.rand(edges, 2, 2, generator=generator)
-    given = [x.to(device) for x in (images, source, source, centres, start, warps)]
-    return f"{edges} edges", lambda: align_patches(*given).positions
+    images, source, centres, start, warps = (x.to(device) for x in (images, source, centres, start, warps))
+    return f"{edges} edges", lambda: align_patches(images, source, source, centres, start, warps).positions
 
 
 def window_solver(generator: torch.Generator, device: torch.device) -> tuple[str, Call]:
@@ -74,9 +76,10 @@ def window_solver(generator: torch.Generator, device: torch.device) -> tuple[str
     kk, jj = torch.arange(count).repeat_interleave(frames), torch.arange(frames).repeat(count)
     targets = patches[:, kk, :2, 1, 1] + torch.rand(1, len(kk), 2, generator=generator)
     weights = torch.rand(1, len(kk), 2, generator=generator)
-    given = poses, patches.contiguous(), intrinsics, targets, weights, kk // per_frame, jj, kk
-    there = [x.to(device) for x in given]
-    return f"{len(kk)} edges", lambda: bundle_adjust(*there, options).poses_cw
+    poses, patches, intrinsics = (x.to(device) for x in (poses, patches.contiguous(), intrinsics))
+    targets, weights, ii, jj, kk = (x.to(device) for x in (targets, weights, kk // per_frame, jj, kk))
+    problem = PatchProblem(poses, patches, intrinsics, targets, weights, ii, jj, kk)
+    return f"{len(kk)} edges", lambda: solve(problem, options).poses_cw
 
 
 KERNELS: dict[str, Callable[[torch.Generator, torch.device], tuple[str, Call]]] = {

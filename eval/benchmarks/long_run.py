@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -152,7 +153,7 @@ def read_csv(file: Path) -> list[Row]:
     try:
         with file.open(encoding="utf-8", newline="") as text:
             return [
-                Row(**{f.name: (int if f.type == "int" else float)(entry[f.name]) for f in fields(Row)})
+                Row(**dict[str, Any]((f.name, (int if f.type == "int" else float)(entry[f.name])) for f in fields(Row)))
                 for entry in csv.DictReader(text)
             ]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -225,7 +226,7 @@ def run(count: int, walk: int, fps: float) -> list[Row]:
     settle_threads()
     if walk < 2 or fps <= 0:
         raise DvoError("out of range", field="--walk, --fps", remedy="give 2 frames or more, and a positive rate")
-    options = {
+    options: dict[str, Any] = {
         "frames": walk,
         "family": "hall",
         "kind": "revisit",
@@ -237,7 +238,9 @@ def run(count: int, walk: int, fps: float) -> list[Row]:
     frames = list(make_sequence(SEED, **options))
     rows: list[Row] = []
     try:
-        for row in measure(load("small", device="cpu"), there_and_back(frames, count, 1 / fps)):
+        odometry = load("small", device="cpu")
+        assert isinstance(odometry, PatchOdometry)
+        for row in measure(odometry, there_and_back(frames, count, 1 / fps)):
             rows.append(row)
             if row.frame % 1000 == 0:
                 print(

@@ -12,6 +12,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from importlib import import_module
 from itertools import islice
 from typing import Any
 
@@ -85,10 +86,11 @@ def bundle_adjustment(repeats: int, batch: int = 1, frames: int = 8, per_frame: 
     weights = torch.rand(targets.shape, generator=generator)
     plan = edge_plan(ii, jj, kk, frames, count)
     best = float("inf"), float("inf")
+    adjust: Any = dvo.bundle_adjust  # it returned a pair before it returned a BAResult
     for _ in range(repeats):
         leaves = [x.clone().requires_grad_() for x in (poses, patches, intrinsics, targets, weights)]
         start = now()
-        found: Any = dvo.bundle_adjust(*leaves, ii, jj, kk, plan=plan)
+        found = adjust(*leaves, ii, jj, kk, plan=plan)
         moved, refined = (found.poses_cw, found.patches) if hasattr(found, "poses_cw") else found
         (moved.sum() + refined.sum()).backward()
         best = min(best, since(start))
@@ -108,10 +110,10 @@ def training() -> Callable[[], Seconds]:
     try:
         from dvo.models.schedule import training_schedule
     except ImportError:  # before networks had a room of their own
-        from dvo.models.schedule import training_schedule  # type: ignore[no-redef]
+        training_schedule = import_module("dvo.nets.schedule").training_schedule
 
     clip = make_clip(0, 1, frames=8, height=120, width=160, flow_range=(1.0, 14.0))
-    model = dvo.load_model("small").train()
+    model: Any = dvo.load_model("small").train()
     stages = training_schedule(8, model.config.training_patches, 10, 4, 4, model.config.self_edges)
 
     def step() -> Seconds:

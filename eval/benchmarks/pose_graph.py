@@ -115,9 +115,11 @@ def _poses(numbers: np.ndarray, planar: bool) -> Tensor:
     return torch.cat((x[:, :2], zero, so3.exp(torch.cat((zero, zero, x[:, 2:]), -1))), -1)
 
 
-def make_laps(
-    count: int, lap: int = 500, every: int = 5, seed: int = 0
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+Graph = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Poses, ``ii``, ``jj``, measurements and information, see :func:`dvo.ba.pose_graph.optimise_pose_graph`."""
+
+
+def make_laps(count: int, lap: int = 500, every: int = 5, seed: int = 0) -> Graph:
     """Synthetic pose graph in Sim(3): noisy motions along laps of a circle, and loop edges to the lap before.
 
     Args:
@@ -134,7 +136,7 @@ def make_laps(
     zero = torch.zeros_like(angle)
     centre = torch.stack((10 * angle.sin(), 0.001 * torch.arange(count), 10 * angle.cos()), -1)
     true = sim3.from_se3(se3.inverse(torch.cat((centre, so3.exp(torch.stack((zero, angle, zero), -1))), -1)))
-    loops = torch.arange(lap, count, every)
+    loops = torch.arange(min(lap, count), count, every)
     ii = torch.cat((torch.arange(count - 1), loops - lap))
     jj = torch.cat((torch.arange(1, count), loops))
     sigma = torch.tensor([2e-3] * 3 + [1e-3] * 3 + [2e-3], dtype=torch.float64)
@@ -162,8 +164,10 @@ def gtsam_minimum(file: Path) -> tuple[float, float]:
     spatial = "EDGE_SE3" in file.read_text(encoding="utf-8")
     graph, start = gtsam.readG2o(str(file), spatial)
     first = min(start.keys())
-    held = gtsam.NonlinearEqualityPose3 if spatial else gtsam.NonlinearEqualityPose2
-    graph.add(held(first, start.atPose3(first) if spatial else start.atPose2(first)))
+    if spatial:
+        graph.add(gtsam.NonlinearEqualityPose3(first, start.atPose3(first)))
+    else:
+        graph.add(gtsam.NonlinearEqualityPose2(first, start.atPose2(first)))
     settings = gtsam.LevenbergMarquardtParams()
     settings.setRelativeErrorTol(LMOptions().tolerance)
     began = time.perf_counter()
@@ -193,7 +197,7 @@ def main() -> None:
         f" {'steps':>5} {'s':>7} {'cpu s':>7}" + (f" {'GTSAM':>15} {'s':>7} {'ratio':>6}" if arguments.gtsam else "")
     )
 
-    def row(name: str, chart: Chart, graph: tuple[Tensor, ...], file: Path | None = None) -> None:
+    def row(name: str, chart: Chart, graph: Graph, file: Path | None = None) -> None:
         seconds, cpu, peers = [], [], []
         for _ in range(repeat):
             options = PoseGraphOptions(chart=chart, solver=solver, start=arguments.start)

@@ -23,6 +23,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,6 +35,7 @@ from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
 from dvo.metrics import associate, evaluate, fit_alignment, transform
+from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.synth.protocols import Motion
 from dvo.synth.sequence import film, make_sequence
 from eval.suites.selection import load_suites
@@ -70,6 +72,7 @@ class Recorded:
 def saved(recorded: Recorded, seed: int, file: Path) -> Trajectory:
     """Track the first third and save it; the trajectory that the map holds."""
     odometry = dvo.load("small", seed=seed)
+    assert isinstance(odometry, PatchOdometry)
     for frame in islice(recorded.source, len(recorded.truth) // 3):
         odometry.track(frame)
     odometry.save(file)
@@ -99,7 +102,7 @@ def error_percent(estimate: dvo.Estimate, known: Trajectory, truth: Trajectory) 
 
 ROOMS = (63, 101, 102, 103, 104, 105, 106)
 LIT, DARK, FPS = 34, 10, 15.0
-SHORT = {"keyframe_motion": 0.5, "removal": 5, "lifetime": 4, "optimisation": 5, "join_inliers": 1.0}
+SHORT: dict[str, Any] = {"keyframe_motion": 0.5, "removal": 5, "lifetime": 4, "optimisation": 5, "join_inliers": 1.0}
 JUMPS = ((102, (0.5, 0.0, 0.0), 15.0), (103, (0.5, 0.0, 0.2), 15.0), (101, (0.8, 0.0, 0.0), 20.0))
 """Room, translation in the camera (m) and turn to the right (degrees)."""
 BEFORE, BEHIND, GAP = 32, 40, 2.0

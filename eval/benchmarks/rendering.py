@@ -125,8 +125,9 @@ def main() -> None:
     reuse_freed_memory()
     torch.set_num_threads(options.threads)
     devices = [torch.device("cpu")]
-    if torch.accelerator.is_available():
-        devices.append(torch.device(torch.accelerator.current_accelerator().type))
+    accelerator = torch.accelerator.current_accelerator() if torch.accelerator.is_available() else None
+    if accelerator is not None:
+        devices.append(torch.device(accelerator.type))
     for device in devices:
         print(f"frames/s on {device}, {options.threads} threads" if device.type == "cpu" else f"frames/s on {device}")
         print(f"{'family':<10}" + "".join(f"{f'{width}x{height}':>10}" for height, width in SIZES))

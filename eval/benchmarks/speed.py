@@ -60,8 +60,11 @@ def find_sequences(wanted: Sequence[str]) -> list[tuple[Suite, Recording]]:
     for name in dict.fromkeys(wanted):
         if name not in known and not Path(name).is_dir():
             raise DvoError(f"no sequence '{name}'", field="--sequences", remedy="see: python -m eval list")
-        suite = None if name in known else suite_of_folder(Path(name))
-        found.append(known[name] if suite is None else (suite, suite.sequences[0]))
+        if name in known:
+            found.append(known[name])
+        else:
+            own = suite_of_folder(Path(name))
+            found.append((own, own.sequences[0]))
     return found
 
 

@@ -15,6 +15,7 @@ import torch
 
 from dvo.core.allocator import reuse_freed_memory
 from dvo.core.command_line import OneLineParser
+from dvo.core.errors import DvoError
 from dvo.core.threads import settle_threads
 from dvo.odometry.load import load
 from dvo.odometry.patch.tracker import PatchOdometry
@@ -51,6 +52,9 @@ def main() -> None:
 
     def ready() -> PatchOdometry:
         odometry = load(options.weights)
+        if not isinstance(odometry, PatchOdometry):
+            remedy = "give weights of a patch network"
+            raise DvoError("has no such stages", file=options.weights, field="--weights", remedy=remedy)
         for frame in frames[: options.warmup]:
             odometry.track(frame)
         return odometry

@@ -106,8 +106,8 @@ def all_errors(
     align = suite.alignment
     pieces = align_segments(segments, reference, align, rpe_gap=suite.rpe_gap, most=most)
     whole = pieces.whole
-    rescaled = [align_pair(per_frame_scale(*world), world[1], align) for world in pieces.worlds]
-    rescaled = [pair for pair in rescaled if isinstance(pair, Aligned)]
+    pairs = [align_pair(per_frame_scale(*world), world[1], align) for world in pieces.worlds]
+    rescaled = [pair for pair in pairs if isinstance(pair, Aligned)]
     scored = pieces.scored
     return Errors(
         metrics=metrics_of(*scored, unscored=pieces.unscored) if scored else whole.metrics,
@@ -161,10 +161,10 @@ def align_segments(
     whole = evaluate_segments(segments, reference, align, rpe_gap=rpe_gap, max_dt=max_dt, most=most)
     if len(segments) == 1:
         estimate = segments[0].trajectory
-        pair = align_pair(estimate, reference, align, rpe_gap=rpe_gap, max_dt=max_dt)
-        if not isinstance(pair, Aligned):
+        only = align_pair(estimate, reference, align, rpe_gap=rpe_gap, max_dt=max_dt)
+        if not isinstance(only, Aligned):
             return Pieces((), (), ((estimate, reference),), (), whole)
-        return Pieces((pair,), (), ((estimate, reference),), ((estimate, pair.scale),), whole)
+        return Pieces((only,), (), ((estimate, reference),), ((estimate, only.scale),), whole)
     worlds = match_worlds(segments, reference, max_dt)
     chosen = scored_worlds(worlds, most)
     scored: list[Aligned] = []

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import fields, make_dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,8 +34,8 @@ _FIRST = (
 )  # fmt: skip
 _REST = tuple(name for name in METRICS if name not in _FIRST)
 
-Row = make_dataclass(
-    "Row",
+_Columns: Any = make_dataclass(
+    "_Columns",
     [
         *_ABOUT,
         *_COUNTS,
@@ -45,16 +46,22 @@ Row = make_dataclass(
         *_MEASURED,
     ],  # fmt: skip
     frozen=True,
-    namespace={
-        "__module__": __name__,
-        "__doc__": """One run in results.csv; fields are the columns, nan where a value has no meaning.
+)
+
+
+class Row(_Columns):
+    """One run in results.csv; fields are the columns, nan where a value has no meaning.
 
     Beside those of the run they are the metrics of :mod:`eval.scoring.metric_table`. ``threads``, ``parallel`` and
     ``device`` tell how the resources were measured; ``parallel`` above 1 means on a shared machine.
-    """,
-        "failed": property(lambda row: row.status != "ok"),
-    },
-)
+    """
+
+    @property
+    def failed(self) -> bool:
+        """True unless the run has come to its end."""
+        return self.status != "ok"
+
+
 COLUMNS = tuple(column.name for column in fields(Row))
 
 

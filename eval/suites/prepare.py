@@ -10,6 +10,7 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.core.text import print_line
+from dvo.data.images.images import read_image
 from eval.suites.rendered import RECORD, place_of, rendered_folder
 from eval.suites.suite import Suite
 
@@ -63,12 +64,19 @@ def contact_sheet(folders: list[Path], columns: int = 6, width: int = 200) -> np
     for folder in folders:
         files = sorted((folder / "rgb").iterdir(), key=lambda file: float(file.stem))  # in order of time
         chosen = [files[i] for i in np.linspace(0, len(files) - 1, columns).round().astype(int)]
-        cells = [cv2.resize(cv2.imread(str(f)), (width, width * 3 // 4), interpolation=cv2.INTER_AREA) for f in chosen]
+        cells = [cv2.resize(_read(file), (width, width * 3 // 4), interpolation=cv2.INTER_AREA) for file in chosen]
         name = folder.name.rsplit("-", 1)[0]
         cv2.putText(cells[0], name, (3, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.38, (0, 0, 0), 3, cv2.LINE_AA)
         cv2.putText(cells[0], name, (3, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.38, (255, 255, 255), 1, cv2.LINE_AA)
         rows.append(np.concatenate(cells, 1))
-    return np.concatenate(rows)[..., ::-1]
+    return np.concatenate(rows)
+
+
+def _read(file: Path) -> np.ndarray:
+    image = read_image(file)
+    if image is None:
+        raise DvoError("cannot be read", file=file, remedy="remove its folder, and prepare the suite again")
+    return image
 
 
 def write_sheet(path: Path, folders: list[Path]) -> None:

@@ -46,25 +46,27 @@ _MOVES = {_aten._to_copy.default, _aten.copy_.default}
 class _OnDevice(Tensor):
     """A tensor of the device, whose values are those of a tensor on the CPU."""
 
-    values: Tensor
+    on_cpu: Tensor
 
     @staticmethod
     def __new__(cls, values: Tensor) -> _OnDevice:
-        made = Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+        made = Tensor._make_wrapper_subclass(
             cls, values.shape, strides=values.stride(), storage_offset=values.storage_offset(), dtype=values.dtype,
             device=DEVICE, requires_grad=False,
         )  # fmt: skip
-        made.values = values
+        made.on_cpu = values
         return made
 
-    def __repr__(self, **_: Any) -> str:
-        return f"on_device({self.values!r})"
+    def __repr__(self, **_: Any) -> str:  # type: ignore[override]
+        return f"on_device({self.on_cpu!r})"
 
     def tolist(self) -> Any:
         return self.cpu().tolist()
 
     @classmethod
-    def __torch_dispatch__(cls, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(  # type: ignore[override]
+        cls, operation: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         return _computed(operation, args, kwargs or {})
 
 
@@ -85,7 +87,7 @@ def _computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     strangers = [x for x in strangers if not any(x is one for one in index)]  # indices are moved by torch
     if inside and strangers and not moved:
         raise RuntimeError(f"Expected all tensors to be on the same device: {operation} of {DEVICE} and cpu")
-    plain = tree_map(lambda x: x.values if isinstance(x, _OnDevice) else x, (args, kwargs))
+    plain = tree_map(lambda x: x.on_cpu if isinstance(x, _OnDevice) else x, (args, kwargs))
     if placed is not None:
         plain[1]["device"] = torch.device("cpu")
     found = operation(*plain[0], **plain[1])
@@ -98,7 +100,7 @@ def _computed(operation: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def _values(x: Tensor) -> Tensor:
-    return x.values if isinstance(x, _OnDevice) else x
+    return x.on_cpu if isinstance(x, _OnDevice) else x
 
 
 class Waits(TorchDispatchMode):

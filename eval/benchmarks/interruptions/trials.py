@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -107,7 +108,7 @@ def rendered(seed: int, split: str, count: int) -> Clip:
     Returns:
         The clip.
     """
-    options = {"family": FAMILIES[seed % len(FAMILIES)], "kind": "handheld", "fps": FPS, "apart": True}
+    options: dict[str, Any] = {"family": FAMILIES[seed % len(FAMILIES)], "kind": "handheld", "fps": FPS, "apart": True}
     sequence = make_sequence(FIRST_SEED[split] + seed, frames=count, **options)
     return Clip(f"{FAMILIES[seed % len(FAMILIES)]} {seed}", list(sequence), sequence.groundtruth)
 

@@ -19,6 +19,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
@@ -95,7 +96,8 @@ def read_runs(file: Path | None) -> list[Run]:
                     raise
                 break  # the process was killed while it wrote
             # JSON has no nan; a value without a meaning is null.
-            runs.append(Run(**{k: float("nan") if entry[k] is None else entry[k] for k in known & set(entry)}))
+            given: dict[str, Any] = {k: float("nan") if entry[k] is None else entry[k] for k in known & set(entry)}
+            runs.append(Run(**given))
     except (OSError, ValueError, TypeError) as error:
         raise DvoError(f"not runs of this benchmark ({error})", file=file, remedy="give another --out") from error
     return runs

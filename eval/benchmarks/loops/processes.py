@@ -45,7 +45,8 @@ class Alternating:
             DvoError: a process ended without a result.
         """
         if task not in self._done:
-            other = replace(task, **({"dark": not task.dark} if task.mode == "blackout" else {"loops": not task.loops}))
+            is_dark = task.mode == "blackout"
+            other = replace(task, dark=not task.dark) if is_dark else replace(task, loops=not task.loops)
             turns = [multiprocessing.get_context("spawn").Semaphore(first) for first in (1, 0)]
             with _process(*turns) as one, _process(*reversed(turns)) as two:
                 futures = {task: one.submit(_in_turns, task), other: two.submit(_in_turns, other)}

@@ -127,4 +127,4 @@ def spoil(network: torch.nn.Module, number: int) -> None:
     with torch.no_grad():
         for parameter in network.parameters():
             if parameter.dim() > 1:
-                parameter += share * parameter.std() * torch.randn(parameter.shape, generator=generator)
+                parameter.add_(share * parameter.std() * torch.randn(parameter.shape, generator=generator))

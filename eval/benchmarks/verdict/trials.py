@@ -108,11 +108,13 @@ def carry_out(trial: Trial) -> Outcome:
 
     def build(seed: int) -> PatchOdometry:
         odometry = dvo.load("small", device="cpu", seed=seed, loops=False)
+        assert isinstance(odometry, PatchOdometry)
         if trial.kind == "weights":
             failures.spoil(odometry.model, trial.number)
         return odometry
 
     result = session.run(build(0), changed, again=build).result
+    assert result.quality is not None
     quality = jsonable(asdict(result.quality))
     rows = len(result.trajectory)
     if trial.kind == "still":
@@ -120,7 +122,7 @@ def carry_out(trial: Trial) -> Outcome:
     found = evaluate(result.trajectory, truth)
     if trial.options["kind"] == "rotation":
         return Outcome(trial.kind, trial.number, found.rpe_rot_deg > TURNED, None, None, rows, quality)
-    ate, best = (None, None) if found.reason else (found.ate_percent, None)
+    ate, best = None if found.reason else found.ate_percent, None
     if ate is not None and ate > WRONG:
         best = min(_ate(name, frames, truth) for name in ("dvo-small", "keyframe", "klt-pnp"))
     wrong = ate is not None and ate > max(WRONG, TIMES * (best or 0.0))

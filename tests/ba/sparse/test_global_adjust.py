@@ -13,6 +13,7 @@ from torch import Tensor
 from dvo.ba.factors import DepthPrior, PosePrior, RelativePose
 from dvo.ba.kernels import Kernel
 from dvo.ba.patch_problem import PatchProblem
+from dvo.ba.solve import solve
 from dvo.ba.sparse import equations as sparse
 from dvo.ba.sparse import schur_pattern
 from dvo.ba.sparse.global_adjust import GlobalBAOptions, GlobalBAResult, SparseProblem, global_bundle_adjust
@@ -140,8 +141,8 @@ def test_storage_grows_with_edges():
     few = LMOptions(max_iterations=1)
     per_edge = []
     for frames in (40, 80, 160):
-        graph = make_graph(frames, per_frame=12, reach=4, loop_reach=1)
-        result = global_bundle_adjust(*graph.arguments(), options=GlobalBAOptions(solver=few))
+        graph, _ = make_graph(frames, per_frame=12, reach=4, loop_reach=1)
+        result = solve(graph, GlobalBAOptions(solver=few))
         seen = torch.stack((torch.cat((graph.ii, graph.jj)), torch.cat((graph.kk, graph.kk))))
         observations = torch.unique(seen[:, seen[0] > 0], dim=1).shape[1]
         pair = torch.stack((torch.minimum(graph.ii, graph.jj), torch.maximum(graph.ii, graph.jj)))
@@ -170,10 +171,10 @@ def test_the_reduced_system_stays_sparse():
 
 def solve_loop(**changes: object) -> tuple[GlobalBAResult, list[float]]:
     dtype = changes.pop("dtype", torch.float64)
-    graph = make_graph(100, per_frame=16, reach=8, loop_reach=2, noise=0.1, wrong=0.02, dtype=dtype)
+    graph, true_poses_cw = make_graph(100, per_frame=16, reach=8, loop_reach=2, noise=0.1, wrong=0.02, dtype=dtype)
     options = GlobalBAOptions(kernel=Kernel("huber", 1.0), solver=LMOptions(max_iterations=15, tolerance=1e-5))
-    result = global_bundle_adjust(*graph.arguments(), options=replace(options, **changes))
-    return result, [position_error(x, graph.true_poses_cw) for x in (graph.poses_cw, result.poses_cw)]
+    result = solve(graph, replace(options, **changes))
+    return result, [position_error(x, true_poses_cw) for x in (graph.poses_cw, result.poses_cw)]
 
 
 @pytest.mark.long

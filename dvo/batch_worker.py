@@ -1,4 +1,4 @@
-"""Process of one video of ``dvo batch``: ``python -m dvo.commands.batch_worker PARENT run ...`` is ``dvo run ...``.
+"""Process of one video of ``dvo batch``: ``python -m dvo.batch_worker PARENT run ...`` is ``dvo run ...``.
 
 It stops as with SIGTERM when the process of the number PARENT, which has started it, is gone.
 """

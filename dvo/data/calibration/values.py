@@ -101,7 +101,7 @@ def from_values(data: Any, path: Path, camera: int | None = None) -> Calibration
     Raises:
         DvoError: as :func:`dvo.data.calibration.read.read_calibration`; the signs of the focal lengths are not checked.
     """
-    documents = [fields.plain(document) for document in (data if isinstance(data, list) else [data])]
+    documents = [fields.plain(_merged(document)) for document in (data if isinstance(data, list) else [data])]
     mappings = [document for document in documents if isinstance(document, dict)]
     if not mappings:
         raise DvoError("no keys in it", file=path, field="intrinsics", remedy=EXPECTED)
@@ -113,6 +113,14 @@ def from_values(data: Any, path: Path, camera: int | None = None) -> Calibration
         message = f"{len(read)} documents with different cameras in it"
         raise DvoError(message, file=path, field="intrinsics", remedy="leave one of them")
     return read[0]
+
+
+def _merged(document: Any) -> Any:
+    """One mapping of a list of entries, ``- K: ...`` and ``- D: ...``."""
+    if not isinstance(document, list) or not all(isinstance(part, dict) and len(part) == 1 for part in document):
+        return document
+    merged = {key: value for part in document for key, value in part.items()}
+    return merged if len(merged) == len(document) else document
 
 
 def _missing(mappings: Sequence[dict[str, Any]]) -> str:
@@ -189,6 +197,10 @@ def _calibration(entries: Entries, path: Path) -> Calibration:
     calibration = _cropped(replace(calibration, width=width, height=height), entries, path)
     calibration = _with_sensors(calibration, entries, path)
     model, coefficients = _lens(entries, before, path)
+    for name, value in zip(LENSES[model].names, coefficients, strict=False):  # the same once more, by name
+        for one in entries.found:
+            if name in one.calls and not isinstance(one.value, bool | str | list | dict) and one.value == value:
+                one.used = True
     if model == "fov" and width and height and 0 < calibration.cx < 1 and 0 < calibration.cy < 1:  # PTAM, vikit
         calibration = replace(
             calibration, fx=calibration.fx * width, fy=calibration.fy * height,

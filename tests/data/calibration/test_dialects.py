@@ -554,6 +554,10 @@ READ = [
     ("matlab_stereo.json", json.dumps({"CameraParameters1": MATLAB, "CameraParameters2": {**MATLAB,
      "RadialDistortion": [0, 0]}}), NUMBERS, "radtan", FIVE, (640, 480)),
     ("matlab.txt", DISPLAYED, NUMBERS, "radtan", (0.1, -0.2, 0, 0, 0), (640, 480)),
+    ("entries.yaml", f"- K: {ROWS}\n- D: [{list(FIVE)}]\n- R: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n- t: [[1], [2]]\n",
+     NUMBERS, "radtan", FIVE, (None, None)),
+    ("twice.yaml", PINHOLE + f"distortion: {{k1: 0.1, k2: -0.2, p1: 0.003, p2: 0.004, k3: 0.05}}\nD: {list(FIVE)}\n",
+     NUMBERS, "radtan", FIVE, (None, None)),
     ("apart.yaml", PINHOLE + "radial_distortion: [0.1, -0.2, 0.05]\ntangential_distortion: [0.003, 0.004]\n", NUMBERS,
      "radtan", FIVE, (None, None)),
     ("apart.json", json.dumps({"fx": 500, "fy": 510, "cx": 320, "cy": 240, "distortion": {"radial": [0.1, -0.2],
@@ -753,6 +757,7 @@ REFUSED = [
     ("a2d2.json", json.dumps({"CamMatrix": [[400, 0, 320], [0, 410, 240], [0, 0, 1]], "CamMatrixOriginal":
      [[500, 0, 320], [0, 510, 240], [0, 0, 1]], "Distortion": [KC], "Lens": "Fisheye", "Resolution": [640, 480]}),
      "CamMatrixOriginal: is another matrix of a camera with a lens"),
+    ("twice.yaml", PINHOLE + f"distortion: {{k1: 0.1, k2: -0.3}}\nD: {list(FIVE)}\n", "distortion.k2"),
     ("new.yaml", f"new_camera_matrix: {ROWS}\ndist: {list(FIVE)}\n", "that of undistorted images"),
     ("stated.yaml", "fx: 50\nfy: 50\ncx: 320\ncy: 240\nwidth: 640\nheight: 480\n", "fx=50 does not fit"),
     ("profile.json", json.dumps(GYROFLOW | {"digital_lens": "gopro_superview"}), "digital_lens: 'gopro_superview'"),

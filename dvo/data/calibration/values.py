@@ -419,6 +419,8 @@ def _lens(entries: Entries, before: list[float], path: Path) -> tuple[Distortion
     listed = None if values else entries.entry(*_COEFFICIENTS, shape="list") or _single(entries)
     if model is None:
         model = _wide_by_keys(entries)
+    if listed is not None and model in (None, "radtan") and bare(listed.key).startswith("radial"):
+        listed.used, listed = False, None  # none of them is tangential
     if listed is not None:
         values = fields.as_numbers(listed.value, path, "coefficients").ravel().tolist()
     if model == "mei":

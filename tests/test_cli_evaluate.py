@@ -1,11 +1,14 @@
 """``dvo evaluate``."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 
 from dvo.cli import main
 from dvo.data.trajectory import Trajectory, write_tum
+from dvo.geometry.poses import pose_matrices
 from tests.support.fake_odometry import curve
 
 TIMES = 0.1 * np.arange(60)
@@ -34,6 +37,48 @@ def test_several_against_one(files, capsys):
     assert first.startswith("half.txt: ATE ") and "60 poses, scale 2" in first and "(0.00 %" in first
     assert second.startswith("run: ATE ") and "(0.00 %" not in second
     assert "all.png" in picture and cv2.imread("all.png").std() > 1
+
+
+def rows_of(trajectory, file):
+    matrices = pose_matrices(trajectory.poses_wc)[:, :3].reshape(-1, 12)
+    np.savetxt(file, matrices)
+
+
+def test_files_without_times_are_compared_row_by_row(files, capsys):
+    """As KITTI's tool does; with a file that has times, or has other rows, nothing tells which rows belong together."""
+    rows_of(TRUTH, "00.txt")
+    rows_of(changed(0.5), "est.txt")
+    assert main(["evaluate", "00.txt", "est.txt"]) == 0
+    assert "60 poses, scale 2" in capsys.readouterr().out
+    numbered = np.column_stack([np.arange(60)[5:], np.loadtxt("est.txt")[5:]])
+    np.savetxt("numbered.txt", numbered)
+    assert main(["evaluate", "00.txt", "numbered.txt"]) == 0
+    assert "55 poses, scale 2" in capsys.readouterr().out
+    rows_of(Trajectory(TIMES[1:], TRUTH.poses_wc[1:]), "short.txt")
+    for other, said in (
+        ("short.txt", "59 rows without times, but 00.txt has 60"),
+        ("half.txt", "half.txt: times, but"),
+    ):
+        assert main(["evaluate", "00.txt", "est.txt", other]) == 2
+        assert said in capsys.readouterr().err
+    assert main(["evaluate", "half.txt", "00.txt"]) == 2
+    assert "60 rows without times, but half.txt has times" in capsys.readouterr().err
+
+
+def test_results_up_to_scale_have_no_metres(files, tmp_path, capsys):
+    facts = {
+        "odometry": "a",
+        "source": "b",
+        "frames": {"read": 60, "lost": 0},
+        "segments": [],
+        "breaks": [],
+        "info": {},
+    }
+    (tmp_path / "run" / "run.json").write_text(json.dumps(facts))
+    assert main(["evaluate", "run", "half.txt"]) == 0
+    assert "run is up to scale" in capsys.readouterr().out
+    assert main(["evaluate", "truth.txt", "run"]) == 0
+    assert "up to scale" not in capsys.readouterr().out
 
 
 def test_what_cannot_be_compared(files, capsys):

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from dvo.commands import NOTHING_TRACKED, OK
+from dvo.commands.base_frame import is_metric
 from dvo.commands.console import say, warn
 from dvo.commands.places import check_outputs
 from dvo.commands.report import error_text
 from dvo.core.errors import DvoError
 from dvo.data.files.output import check_place, replaced
-from dvo.data.readers.groundtruth import read_groundtruth
+from dvo.data.readers.groundtruth import read_groundtruth, rows_without_times
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Metrics, align_trajectory, associate
 from dvo.metrics import evaluate as errors_of
 from dvo.metrics.table import shown
 from dvo.session import results
+from dvo.session.run_facts import read_facts
 from dvo.viz.plot import Panel, Track, plot_panels
 
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
@@ -50,10 +55,14 @@ def evaluate(arguments: argparse.Namespace) -> int:
         inputs = {f"ESTIMATE {text}": _file(text) for text in arguments.estimates}
         check_outputs({"--out": out}, {"REFERENCE": _file(arguments.reference), **inputs})
         check_place(out, "--out")
-    reference = _read(arguments.reference)
+    given = [arguments.reference, *arguments.estimates]
+    frames = _frames(given)
+    reference = _read(arguments.reference, frames)
+    if _is_up_to_scale(Path(arguments.reference)):
+        say(f"note: {arguments.reference} is up to scale: m is its unit, no metre")
     found = []
     for text in arguments.estimates:
-        trajectory = _read(text)
+        trajectory = _read(text, frames)
         metrics = errors_of(trajectory, reference, arguments.align, max_dt=arguments.max_dt)
         found.append(_Compared(text, trajectory, metrics))
         _print(found[-1], reference, arguments.align)
@@ -72,11 +81,52 @@ def _file(text: str) -> Path:
     return path / results.TRAJECTORY if path.is_dir() else path
 
 
-def _read(text: str) -> Trajectory:
-    path = _file(text)
-    if not path.is_file():
-        raise DvoError("no such file", file=path, remedy="give trajectories (TUM), or results folders of dvo run")
-    return read_groundtruth(path, None)
+def _frames(texts: Sequence[str]) -> np.ndarray | None:
+    """Numbers of the frames in place of times, if the files have no times or such numbers (KITTI); None if all have.
+
+    Raises:
+        DvoError: a file that is not there, some with times and some without, or other numbers of rows.
+    """
+    for text in texts:
+        if not _file(text).is_file():
+            remedy = "give trajectories (TUM), or results folders of dvo run"
+            raise DvoError("no such file", file=_file(text), remedy=remedy)
+    rows = [rows_without_times(_file(text)) for text in texts]
+    if all(count is None for count in rows):
+        return None
+    for text, count in zip(texts, rows, strict=True):
+        if count != rows[0] and not (count is None and rows[0] and _are_numbers(_file(text), rows[0])):
+            first = "times" if rows[0] is None else f"{rows[0]} rows without times"
+            this = "times" if count is None else f"{count} rows without times"
+            remedy = "give trajectories with times, or one row for each image in all of them"
+            raise DvoError(f"{this}, but {texts[0]} has {first}", file=_file(text), remedy=remedy)
+    return np.arange(rows[0] or 0, dtype=np.float64)
+
+
+def _are_numbers(file: Path, frames: int) -> bool:
+    """True for times that are the numbers of frames."""
+    times = read_groundtruth(file, None).timestamps
+    return bool(((times == np.rint(times)) & (times >= 0) & (times < frames)).all())
+
+
+def _labels(texts: Sequence[str]) -> list[str]:
+    """The ends of the paths, as long as they need to be to differ."""
+    parts = [Path(text).parts for text in texts]
+    for count in range(1, max(map(len, parts)) + 1):
+        ends = [str(Path(*part[-count:])) if part else text for part, text in zip(parts, texts, strict=True)]
+        if len(set(ends)) == len(set(texts)):
+            return ends
+    return list(texts)
+
+
+def _is_up_to_scale(path: Path) -> bool:
+    """True for the results of a run without a metric scale."""
+    file = path / results.SUMMARY
+    return file.is_file() and not is_metric(read_facts(file)["info"])
+
+
+def _read(text: str, frames: np.ndarray | None) -> Trajectory:
+    return read_groundtruth(_file(text), frames)
 
 
 def _print(one: _Compared, reference: Trajectory, align: str) -> None:
@@ -97,11 +147,12 @@ def _span(trajectory: Trajectory) -> str:
 def _draw(out: Path, found: list[_Compared], reference: Trajectory, arguments: argparse.Namespace) -> None:
     """All estimates, aligned, over the part of the reference that they span."""
     tracks, spans = [], []
-    for colour, one in enumerate(found):
+    labels = _labels([one.label for one in found])
+    for colour, (one, name) in enumerate(zip(found, labels, strict=True)):
         _, rows = associate(one.trajectory, reference, arguments.max_dt)
         spans += [rows.min(), rows.max()]
         aligned = align_trajectory(one.trajectory, reference, arguments.align, arguments.max_dt)
-        label = f"{one.label[-40:]}, {one.metrics.ate_percent:.2f} %"
+        label = f"{name[-40:]}, {one.metrics.ate_percent:.2f} %"
         tracks.append(Track(aligned, label, colour))
     span = slice(int(min(spans)), int(max(spans)) + 1)
     truth = Trajectory(reference.timestamps[span], reference.poses_wc[span])

@@ -167,7 +167,7 @@ def open_source(
             f"the halves of the images look alike, {halves}: if this is stereo, track one of them "
             f"(ffmpeg -vf crop={part})"
         )
-    if recording.kind == "folder" and are_interlaced(raw.image for raw in recording.frames(Log())):
+    if recording.kind in ("folder", "rosbag") and are_interlaced(raw.image for raw in recording.frames(Log())):
         doubts.append(INTERLACED)
     reduction = reduction_to(max_pixels, width, height)
     size, masks = (width, height), None

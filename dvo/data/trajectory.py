@@ -118,8 +118,8 @@ def read_tum(path: Path | str) -> Trajectory:
         Camera-to-world poses in the order of the rows, quaternions normalised; of rows with the same time the first.
 
     Raises:
-        DvoError: missing file, no rows, a row without 8 finite numbers, a quaternion of zero length, or times that
-            decrease.
+        DvoError: missing file, no rows, a row without 8 finite numbers, a quaternion of another length than one, or
+            times that decrease.
 
     Example:
         >>> from pathlib import Path
@@ -174,6 +174,9 @@ def read_numbers(path: Path, columns: int, row: str, header: str) -> tuple[np.nd
     return np.array(values, dtype=np.float64).reshape(-1, columns), numbers.tolist()
 
 
+_LENGTH = 0.1  # largest difference of the length of a quaternion from one, which rounding may change
+
+
 def unit_quaternions(quaternions: np.ndarray, path: Path, lines: list[int]) -> np.ndarray:
     """Normalise quaternions of a table.
 
@@ -186,13 +189,15 @@ def unit_quaternions(quaternions: np.ndarray, path: Path, lines: list[int]) -> n
         ``(N, 4)`` of length 1.
 
     Raises:
-        DvoError: a length below 1e-6 or above 1e6.
+        DvoError: a length that is not one, as of angles in their place.
     """
     norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    bad = np.flatnonzero(~((norms > 1e-6) & (norms < 1e6)))
+    bad = np.flatnonzero(~(np.abs(norms - 1) <= _LENGTH))
     if len(bad):
-        message, where = "a quaternion has no length", f"line {lines[int(bad[0])]}"
-        raise DvoError(message, file=path, field=where, remedy="correct qx qy qz qw in this row")
+        row = int(bad[0])
+        message = f"a quaternion of the length {norms[row, 0]:.3g}, as if it were none"
+        remedy = "give qx qy qz qw, no angles, in the columns that the format has"
+        raise DvoError(message, file=path, field=f"line {lines[row]}", remedy=remedy)
     return quaternions / norms
 
 

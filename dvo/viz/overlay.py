@@ -19,6 +19,7 @@ from dvo.viz.marks import pixels, shade
 MIN_RATE, MAX_RATE = 1.0, 120.0  # pictures per second of the video
 MAX_PAUSE = 2.0  # seconds for which a picture stays at most; what is longer in the source is shortened
 _LOOKED_AT = 10  # intervals between tracked frames that tell the rate
+_PAUSE = 1.7  # usual steps
 _LATE = 0.5  # seconds by which the video may fall behind the source before a picture is left out
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _STATUS_COLOURS = {
@@ -119,8 +120,7 @@ class OverlayVideo:
 
     def _open(self) -> None:
         """Begin the file, at the rate of the pictures that wait."""
-        steps = np.diff([time for time, _ in self._waiting])
-        rate = 1 / float(np.median(steps)) if len(steps) else MIN_RATE
+        rate = _rate(np.diff([time for time, _ in self._waiting])) if len(self._waiting) > 1 else MIN_RATE
         self._rate = round(min(max(rate, MIN_RATE), MAX_RATE), 2)  # MPEG-4 knows whole ticks up to 65535 a second
         picture = self._waiting[0][1]
         self._size = picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2  # codecs want even sizes
@@ -197,3 +197,10 @@ def _label(picture: np.ndarray, text: str, top: int) -> None:
     # One stroke in one width: OpenCV 5 has glyphs of another shape for each width, so that no outline fits.
     place = (margin, top + margin + height)
     cv2.putText(picture, text, place, _FONT, scale, (255, 255, 255), 1, cv2.LINE_AA)
+
+
+def _rate(steps: np.ndarray) -> float:
+    """Pictures a second, without pauses; of uneven steps rather too many, as a picture that is late stays late."""
+    usual = steps[steps < _PAUSE * np.median(steps)]
+    usual = usual if len(usual) else steps
+    return 1 / max(float(usual.mean() - 2 * usual.std() / len(steps)), 1 / MAX_RATE)

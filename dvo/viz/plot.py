@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 INK, ACCENT, TRUTH, START, PAPER = "#22272e", "#e4572e", "#4a6fa5", "#2a9d5c", "#ffffff"
 COLOURS = (ACCENT, "#8e4ec6", "#b08900", "#00838f", "#c2185b", "#5d4037")  # of segments
 SIZE_INCHES, DPI = (7.6, 6.0), 150
+_LEGEND_COLUMNS = 5
 _INSET = 0.36  # side of the enlarged path in a plan view, of that of the view
 _WIDTH = 66  # letters in a line of a title
 
@@ -148,7 +149,11 @@ def _draw_alone(figure: Figure, panel: Panel, title: str, subtitle: str) -> None
     _draw_panel(plot, panel, SIZE_INCHES[0] / SIZE_INCHES[1])
     _add_title(plot, title, subtitle)
     if plot.get_legend_handles_labels()[0]:  # below the axes: above them is the title, of any length
-        figure.legend(loc="outside lower left", ncols=5, frameon=False, fontsize=9.5)
+        for columns in range(_LEGEND_COLUMNS, 0, -1):
+            legend = figure.legend(loc="outside lower left", ncols=columns, frameon=False, fontsize=9.5)
+            if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+                break
+            legend.remove()
 
 
 def _draw_side_by_side(figure: Figure, panels: Sequence[Panel], title: str, subtitle: str) -> None:

@@ -217,9 +217,14 @@ def test_ground_truth_of_times_that_do_not_increase(make):
         read_state_groundtruth(make.text("t.csv", "5,0,0,0,1,0,0,0\n5,0,0,0,1,0,0,0\n"))
 
 
-def test_a_quaternion_too_long_to_normalise(make):
-    with pytest.raises(DvoError, match="line 1: a quaternion has no length"):
-        read_tum(make.text("t.txt", "0 0 0 0 1e12 1e12 0 0\n"))
+@pytest.mark.parametrize("quaternion", ["1e12 1e12 0 0", "0 0 0 0", "0.1 0.2 0.3 0", "0 0 0 1.2"])
+def test_a_quaternion_that_is_none(make, quaternion):
+    file = make.text("t.txt", f"0 0 0 0 0 0 0 1\n1 0 0 0 {quaternion}\n")
+    with pytest.raises(DvoError, match="line 2: a quaternion of the length"):
+        read_tum(file)
+    assert len(read_tum(make.text("rounded.txt", "0 0 0 0 0.7 0 0 0.7\n"))) == 1
+    with pytest.raises(DvoError, match="line 1: a quaternion of the length 0.37"):  # a time, a position, three angles
+        read_groundtruth(make.text("angles.csv", "14.5,1,2,0,0.1,0.2,0.3\n"), np.zeros(1))
 
 
 def test_ground_truth_of_images_that_share_a_time(make):

@@ -129,7 +129,7 @@ def test_undistort_or_not(make):
 
 def test_groundtruth_option(make):
     folder = make.images("clip", ["0.png", "1.png"])
-    tum = make.text("gt.txt", "#\n0 1 2 3 0 0 0 1\n0.1 2 2 3 0 0 0 2\n")
+    tum = make.text("gt.txt", "#\n0 1 2 3 0 0 0 1\n0.1 2 2 3 0 0 0 1.05\n")
     truth = open_source(folder, calib=make.calib(), groundtruth=tum, fps=10).groundtruth
     assert truth.timestamps.tolist() == [0, 0.1] and truth.poses_wc[1].tolist() == [2, 2, 3, 0, 0, 0, 1]
     poses = np.array([[0, 0, 0, 0, 0, 0, 1.0], [0, 0, 5, 0, 0, 0, 1]])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ _TURN = (
     "places)"
 )
 _EXCHANGED = "its principal point is the centre of images of these sides: exchange width and height in it"
+_LISTED = 20  # cameras of a file that a message names
 _NEAR_CORNER = 0.05  # of the sides: no principal point lies there
 
 _OTHER_SIZE = 0.15  # of the principal point's distance from the corner: more than that of a lens that is off centre
@@ -176,6 +177,30 @@ class Dialect:
 
     matches: Callable[[Path, str], bool]
     read: Callable[[Path, str, int | None], Calibration]
+
+
+def one_of(cameras: Sequence[tuple[str, Calibration]], camera: int | None, path: Path) -> Calibration:
+    """The camera of a file that is asked for.
+
+    Args:
+        cameras: of the file, with their names.
+        camera: position among them; None for the only one, or for any if all are the same.
+        path: of the file, for messages.
+
+    Raises:
+        DvoError: no camera at all, none of that number, or several that differ.
+    """
+    names = ", ".join(f"{number}: {name}" for number, (name, _) in enumerate(cameras[:_LISTED]))
+    names += f" and {len(cameras) - _LISTED} more" if len(cameras) > _LISTED else ""
+    if camera is not None and not 0 <= camera < len(cameras):
+        remedy = f"leave out :{camera}, or give the number of one of {names or 'its cameras'}"
+        raise DvoError(f"no camera {camera} in it", file=path, field="calibration", remedy=remedy)
+    if not cameras:
+        raise DvoError("no camera in it", file=path, field="calibration", remedy=EXPECTED)
+    if camera is None and any(other != cameras[0][1] for _, other in cameras[1:]):
+        remedy = f"give {path.name}:NUMBER of that of the images"
+        raise DvoError(f"{len(cameras)} cameras in it: {names}", file=path, field="calibration", remedy=remedy)
+    return cameras[camera or 0][1]
 
 
 @dataclass(frozen=True)

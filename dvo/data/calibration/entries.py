@@ -65,7 +65,7 @@ CENTRE = ("principalpoint", "pp", "cc", "c", "principal", "centre", "center", "o
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?"
 _ROW = re.compile(rf"[\[(]?\s*{_NUMBER}(?:(?:\s*[,;]\s*|\s+){_NUMBER})+\s*[\])]?")  # a list written as a text
-_OF_MATRICES = frozenset(["rows", "cols", "dt", "data", "type_id", "size", "sizes", "step"])
+_OF_MATRICES = frozenset(["rows", "cols", "dt", "data", "type_id", "type", "size", "sizes", "step"])
 
 
 @dataclass

@@ -24,6 +24,11 @@ _BUILT_IN = {
     "transforms": "dvo.data.calibration.transforms:DIALECT",
     "gyroflow": "dvo.data.calibration.gyroflow:DIALECT",
     "opensfm": "dvo.data.calibration.opensfm:DIALECT",
+    "meshroom": "dvo.data.calibration.meshroom:DIALECT",
+    "openmvg": "dvo.data.calibration.openmvg:DIALECT",
+    "matlab": "dvo.data.calibration.matlab:DIALECT",
+    "middlebury": "dvo.data.calibration.middlebury:DIALECT",
+    "realsense": "dvo.data.calibration.realsense:DIALECT",
     "ost": "dvo.data.calibration.values:OST",
     "xml": "dvo.data.calibration.values:XML",
     "json": "dvo.data.calibration.values:JSON",
@@ -33,7 +38,8 @@ _BUILT_IN = {
 DIALECTS = Registry("calibration dialect", "dvo.calibration_dialects", dict(_BUILT_IN))
 """Names to ``"module:DIALECT"``, each a :class:`dvo.data.calibration.calibration.Dialect`. Those of other packages come
 first, because ``text`` takes any file."""
-_NUMBERED = frozenset(["numpy", "colmap", "kitti raw", "json", "yaml", "xml"])  # that may have several cameras
+_NUMBERED = frozenset(["numpy", "colmap", "kitti raw", "meshroom", "openmvg", "matlab", "middlebury", "realsense",
+                       "json", "yaml", "xml"])  # that may have several cameras  # fmt: skip
 SHORTEST = 0.01
 """Focal length at least, widths of the images: below it, it is no number of pixels."""
 _UNSTATED = 100
@@ -55,7 +61,8 @@ def read_calibration(path: Path | str) -> Calibration:
     ``readout``, the seconds from the first to the last row of a rolling shutter (0, a global one, if it is left out;
     Kalibr's ``line_delay`` is not read). COLMAP's ``cameras.txt`` and ``cameras.bin``. Of a file of several cameras the
     first or the left one is read, or that of the number in ``FILE:NUMBER``; COLMAP's have no first one. NumPy's
-    ``.npz`` of named arrays.
+    ``.npz`` of named arrays; MATLAB's ``cameraParameters`` and ``Calib_Results.m``; scenes of Meshroom and OpenMVG;
+    Middlebury's ``calib.txt``; what the tools of RealSense print.
 
     Args:
         path: of the file.
@@ -75,7 +82,7 @@ def read_calibration(path: Path | str) -> Calibration:
         message = "a folder, no file" if path.is_dir() else "no such file"
         raise DvoError(message, file=path, field="calibration", remedy="give an existing calibration file")
     suffix = path.suffix.lower()
-    limit = _LARGEST if suffix == ".json" else MAX_BYTES
+    limit = _LARGEST if suffix in (".json", ".sfm") else MAX_BYTES
     text = "" if suffix in _BINARY else read_text(path, EXPECTED, limit)
     names = [*(name for name in DIALECTS if name not in _BUILT_IN), *_BUILT_IN]
     dialects: dict[str, Dialect] = {name: DIALECTS.resolve(name) for name in names}

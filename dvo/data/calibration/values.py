@@ -36,6 +36,9 @@ _MODEL_KEYS = (
     "projectionmodel", "projectiontype", "projection", "cameramodel", "modeltype", "cameratype", "model", "cammodel",
     "intrinsicstype", "intrinsicsmodel", "cameramodeltype",
 )  # fmt: skip
+_RADIAL = ("radialdistortion", "radialdistortioncoefficients", "radialdistortioncoeffs", "radialcoefficients",
+           "radialcoeffs")  # fmt: skip
+_TANGENTIAL = tuple(name.replace("radial", "tangential") for name in _RADIAL)
 _FISHEYE_FLAGS = ("fisheyemodel", "isfisheye", "fisheye", "usefisheye", "bfisheye")
 _RADTAN_FLAT = LENSES["radtan"].names
 _FIRST = ("cam0", "camera0", "camera", "camera1", "left", "leftcamera", "cameraleft", "camleft", "0", "l", "1", "color",
@@ -51,6 +54,7 @@ _LONGEST = 3.0  # baseline of a pair of cameras on one device, metres
 _BRACE = re.compile(r'\s*\{\s*"')
 _PAIRED = re.compile(r"(k|m|(?:camera_?)?matrix|camera_?mat|mtx|intrinsics?)_?(left|right|l|r|[0-2]|0[0-3])")
 _REGION = ("x_offset", "y_offset", "width", "height")
+_RECORDED = re.compile(r"^(?:original|orig|raw|distorted)|(?:original|orig|raw|(?<!un)distorted)$")
 _SUFFIX = re.compile(r"(.+?)_?(left|right|l|r|[0-2]|0[0-3])")
 
 
@@ -97,7 +101,7 @@ def from_values(data: Any, path: Path, camera: int | None = None) -> Calibration
     Raises:
         DvoError: as :func:`dvo.data.calibration.read.read_calibration`; the signs of the focal lengths are not checked.
     """
-    documents = [fields.plain(document) for document in (data if isinstance(data, list) else [data])]
+    documents = [fields.plain(_merged(document)) for document in (data if isinstance(data, list) else [data])]
     mappings = [document for document in documents if isinstance(document, dict)]
     if not mappings:
         raise DvoError("no keys in it", file=path, field="intrinsics", remedy=EXPECTED)
@@ -109,6 +113,14 @@ def from_values(data: Any, path: Path, camera: int | None = None) -> Calibration
         message = f"{len(read)} documents with different cameras in it"
         raise DvoError(message, file=path, field="intrinsics", remedy="leave one of them")
     return read[0]
+
+
+def _merged(document: Any) -> Any:
+    """One mapping of a list of entries, ``- K: ...`` and ``- D: ...``."""
+    if not isinstance(document, list) or not all(isinstance(part, dict) and len(part) == 1 for part in document):
+        return document
+    merged = {key: value for part in document for key, value in part.items()}
+    return merged if len(merged) == len(document) else document
 
 
 def _missing(mappings: Sequence[dict[str, Any]]) -> str:
@@ -185,6 +197,10 @@ def _calibration(entries: Entries, path: Path) -> Calibration:
     calibration = _cropped(replace(calibration, width=width, height=height), entries, path)
     calibration = _with_sensors(calibration, entries, path)
     model, coefficients = _lens(entries, before, path)
+    for name, value in zip(LENSES[model].names, coefficients, strict=False):  # the same once more, by name
+        for one in entries.found:
+            if name in one.calls and not isinstance(one.value, bool | str | list | dict) and one.value == value:
+                one.used = True
     if model == "fov" and width and height and 0 < calibration.cx < 1 and 0 < calibration.cy < 1:  # PTAM, vikit
         calibration = replace(
             calibration, fx=calibration.fx * width, fy=calibration.fy * height,
@@ -202,6 +218,11 @@ def _calibration(entries: Entries, path: Path) -> Calibration:
         if matrix is not None:
             message = "is that of undistorted images, but there are coefficients of a lens"
             raise DvoError(message, file=path, field=matrix.name, remedy="give the matrix of the recorded images")
+        other = next((one for one in entries.found if not one.used and _RECORDED.search(bare(one.key))
+                      and not isinstance(one.value, str) and np.size(one.value) == 9), None)  # fmt: skip
+        if other is not None:
+            message = "is another matrix of a camera with a lens"
+            raise DvoError(message, file=path, field=other.name, remedy="leave the matrix of the recorded images alone")
     entries.refuse_unread()
     _refuse_millimetres(calibration, entries, path)
     notes = (*calibration.notes, *_notes(entries))
@@ -355,6 +376,12 @@ def _model(entries: Entries, path: Path) -> DistortionModel | None:
             if model is None and bare(str(entry.value)).removeprefix("distortion") in _IF_ZERO:
                 lists = [one.value for one in entries.found if set(_COEFFICIENTS) & set(one.calls)]
                 model = "none" if lists and all(map(says_nothing, lists)) else None
+                if model is None:
+                    raise DvoError(
+                        f"{str(entry.value)[:60]!r} with coefficients: programs do not agree on what it means",
+                        file=path, field=entry.name,
+                        remedy="calibrate with dvo calibrate --board, or write radtan if they are those of OpenCV",
+                    )  # fmt: skip
             if model is None:
                 raise DvoError(
                     f"unknown distortion model {str(entry.value)[:60]!r}",
@@ -388,10 +415,14 @@ def _model(entries: Entries, path: Path) -> DistortionModel | None:
 
 def _lens(entries: Entries, before: list[float], path: Path) -> tuple[DistortionModel, tuple[float, ...]]:
     model = _model(entries, path)
-    listed = entries.entry(*_COEFFICIENTS, shape="list") or _single(entries)
+    values = _apart(entries, path) if model in (None, "radtan") else []
+    listed = None if values else entries.entry(*_COEFFICIENTS, shape="list") or _single(entries)
     if model is None:
         model = _wide_by_keys(entries)
-    values = [] if listed is None else fields.as_numbers(listed.value, path, "coefficients").ravel().tolist()
+    if listed is not None and model in (None, "radtan") and bare(listed.key).startswith("radial"):
+        listed.used, listed = False, None  # none of them is tangential
+    if listed is not None:
+        values = fields.as_numbers(listed.value, path, "coefficients").ravel().tolist()
     if model == "mei":
         xi = before[:1] or _scalars(entries, path, "xi")
         return "mei", _trimmed("mei", [*xi, *(values or _flat_radtan(entries, path))], path)
@@ -413,6 +444,21 @@ def _lens(entries: Entries, before: list[float], path: Path) -> tuple[Distortion
         return "none", _trimmed("none", values, path)
     kept = _trimmed("radtan", values or _flat_radtan(entries, path), path)
     return ("radtan", kept) if any(kept) else ("none", ())
+
+
+def _apart(entries: Entries, path: Path) -> list[float]:
+    """``k1 k2 p1 p2 k3`` of two or three radial and two tangential coefficients that stand in lists of their own."""
+    tangential = entries.entry(*_TANGENTIAL, "tangential", shape="list")
+    radial = entries.entry(*_RADIAL, *(["radial"] if tangential else []), shape="list")
+    lists = [[] if one is None else fields.as_numbers(one.value, path, one.name).ravel().tolist()
+             for one in (radial, tangential)]  # fmt: skip
+    if len(lists[0]) not in (2, 3) or len(lists[1]) not in (0, 2):
+        for one in (radial, tangential):
+            if one is not None:
+                one.used = False
+        return []
+    k1, k2, k3 = (*lists[0], 0.0)[:3]
+    return [k1, k2, *(lists[1] or [0.0, 0.0]), k3]
 
 
 def _single(entries: Entries) -> Any:

@@ -247,7 +247,7 @@ def clock_of_rows(rows: Sequence[Sequence[str]], header: Sequence[str] | None = 
         return Clock(np.array(dates, dtype=np.float64), "date")
     width = min((len(row) for row in rows), default=0)
     columns = [[_parsed(row[k]) for row in rows] for k in range(width)]
-    named = None if header is None or len(header) != width else _named(header)
+    named = None if header is None or len(header) != width else named_times(header)
     if named is not None:
         column, unit, rest = named
         if rest is not None:
@@ -326,6 +326,26 @@ def unit_of_name(name: str) -> str | None:
     return next((_SPELLED[word] for word in reversed(words) if word in _SPELLED), None)
 
 
+def named_times(header: Sequence[str]) -> tuple[int, str | None, int | None] | None:
+    """Columns of a table that hold times.
+
+    Args:
+        header: names of the columns.
+
+    Returns:
+        Column of the times, their unit if it is stated, and the column of the nanoseconds beside seconds, None for
+        none; None if no name is that of times.
+    """
+    found = [k for k, name in enumerate(header) if is_time_name(name)]
+    found.sort(key=lambda k: not {"header", "stamp"} <= set(_words(header[k])))  # of ROS, before that of arrival
+    if not found:
+        return None
+    units = [unit_of_name(header[k]) for k in found]
+    if len(found) > 1 and units[:2] == ["s", "ns"] and not set(_words(header[found[0]])) & {"time", "timestamp"}:
+        return found[0], None, found[1]
+    return found[0], units[0], None
+
+
 def is_time_name(name: str) -> bool:
     """True for the name of a column of times.
 
@@ -369,17 +389,6 @@ def _two(columns: Sequence[Sequence[int | float | None]], whole: int, rest: int)
     pairs = zip(columns[whole], columns[rest], strict=True)
     joined = [None if a is None or b is None else int(a) * 10**9 + int(b) for a, b in pairs]
     return Clock(_seconds(joined, "ns"), "s", whole)
-
-
-def _named(header: Sequence[str]) -> tuple[int, str | None, int | None] | None:
-    """Column of the times, their unit if it is stated, and the column of the nanoseconds beside seconds."""
-    found = [k for k, name in enumerate(header) if is_time_name(name)]
-    if not found:
-        return None
-    units = [unit_of_name(header[k]) for k in found]
-    if len(found) > 1 and units[:2] == ["s", "ns"] and not set(_words(header[found[0]])) & {"time", "timestamp"}:
-        return found[0], None, found[1]
-    return found[0], units[0], None
 
 
 def _words(name: str) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.clock import Clock, in_seconds, is_time_name, parse_time, read_table, unit_of, unit_of_name
+from dvo.data.files.clock import PARTS, Clock, in_seconds, named_times, parse_time, read_table, unit_of
 from dvo.data.files.files import MAX_NUMBER, parse_number
 from dvo.geometry.poses import poses_from_matrices
 
@@ -27,6 +27,7 @@ class _Columns:
     Attributes:
         time: column.
         unit: of the times, if the header states it.
+        nanoseconds: column of what is beyond whole seconds, None for none.
         pose: columns of ``tx ty tz qx qy qz qw``.
         length: metres of a unit of the positions.
     """
@@ -35,11 +36,13 @@ class _Columns:
     unit: str | None
     pose: tuple[int, ...]
     length: float = 1.0
+    nanoseconds: int | None = None
 
 
 _TUM = _Columns(0, None, tuple(range(1, _NUMBERS)))
 _EUROC = _Columns(0, "ns", (1, 2, 3, 5, 6, 7, 4))  # state_groundtruth_estimate0/data.csv: velocity and biases follow
 _EUROC_NUMBERS = 17
+_OF_CAMERA = re.compile(r"(?:^|[^a-z])[tqrp]?_?(?:cw|c_w|w2c)(?:[^a-z]|$)")  # T_cw
 _RIGID = 0.02  # largest deviation of a rotation from an orthogonal matrix
 _MATRIX = {13: 12, 17: 16}  # numbers of a row of a time and a matrix, and of the matrix
 
@@ -64,7 +67,7 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
     table = read_table(path, f"give a file of rows '{HEADER}'")
     if not table.rows:
         raise DvoError("no poses in it", file=path, remedy=f"give a file of rows '{HEADER}'")
-    columns = None if table.header is None else _named(table.header)
+    columns = None if table.header is None else _named(table.header, path)
     if columns is None and table.header is not None and not table.is_comment:
         names = ", ".join(table.header)[:200]
         raise DvoError(
@@ -92,7 +95,10 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
                 parse_time(fields[columns.time])
                 continue
             pose = [parse_number(text) for text in texts]
-            times.append(parse_time(fields[columns.time]))
+            time = parse_time(fields[columns.time])
+            if columns.nanoseconds is not None:
+                time = int(time) * PARTS["ns"] + int(parse_time(fields[columns.nanoseconds]))
+            times.append(time)
         except (ValueError, IndexError):
             raise _no_row(path, line) from None
         poses.append(pose)
@@ -135,22 +141,33 @@ def _no_row(path: Path, line: int) -> DvoError:
     return DvoError("not a TUM row", file=path, field=f"line {line}", remedy=f"use '{HEADER}'")
 
 
-def _named(header: Sequence[str]) -> _Columns | None:
-    """Columns that a header names; None if it does not name all."""
-    time, found, length = None, dict[str, int](), 1.0
+def _named(header: Sequence[str], path: Path) -> _Columns | None:
+    """Columns that a header names; None if it does not name all.
+
+    Raises:
+        DvoError: poses of the world in the camera, or of two trajectories.
+    """
+    times, length = named_times(header), 1.0
+    found: dict[str, list[int]] = {}
     for k, cell in enumerate(header):
+        if _OF_CAMERA.search(cell.lower()):
+            remedy = "give poses of the camera in the world, T_wc"
+            raise DvoError("poses of the world in the camera", file=path, field=f"column {cell[:40]!r}", remedy=remedy)
         name = re.sub(r"[\[(].*?[\])]", "", cell.lower()).strip()
         part = _part(name)
         if part is not None:
-            found.setdefault(part, k)
+            found.setdefault(part, []).append(k)
             unit = re.search(r"[\[(]\s*(mm|cm|m)\s*[\])]", cell.lower())
-            length = _LENGTHS[unit[1]] if unit and part == "tx" else length
-        elif time is None and is_time_name(cell):
-            time = k
-    if time is None or len(found) < _NUMBERS - 1:
+            length = _LENGTHS[unit[1]] if unit and part == "tx" and len(found[part]) == 1 else length
+    if times is None or len(found) < _NUMBERS - 1:
         return None
-    pose = tuple(found[part] for part in ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
-    return _Columns(time, unit_of_name(header[time]), pose, length)
+    if all(len(columns) > 1 for columns in found.values()):
+        both = f"{header[found['tx'][0]][:40]!r} and {header[found['tx'][1]][:40]!r}"
+        remedy = "leave the columns of one of them"
+        raise DvoError(f"two trajectories, {both}", file=path, field="header", remedy=remedy)
+    pose = tuple(found[part][0] for part in ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
+    column, unit_of_time, nanoseconds = times
+    return _Columns(column, "ns" if nanoseconds is not None else unit_of_time, pose, length, nanoseconds)
 
 
 def _part(name: str) -> str | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from itertools import islice
 
 import numpy as np
@@ -10,6 +10,10 @@ import numpy as np
 DEINTERLACE = "deinterlace the video: ffmpeg -i VIDEO -vf bwdif OUT.mp4"
 INTERLACED = (
     f"the images are interlaced, their even and odd lines of two moments: if they are of a video, {DEINTERLACE}"
+)
+INTERLACED_STREAM = (
+    "the images are interlaced, their even and odd lines of two moments: set the camera or its converter to "
+    "progressive images, or deinterlace them (ffmpeg -i ADDRESS -vf bwdif -f image2pipe - | dvo run -)"
 )
 LOOKED_AT = 16  # images
 _TRIPLES = 8  # of images with motion, that suffice
@@ -23,54 +27,86 @@ _FURTHER = 1.1  # differences to the farthest field over those within an image, 
 _NEAR = 0.6  # place of the nearest field beside those of the same image, from 0 (as near) to 1 (as far as any)
 
 
-def are_interlaced(images: Iterable[np.ndarray]) -> bool:
-    """Find out if images that follow each other are interlaced.
+class FieldTest:
+    """Looks at images as they come and tells if they are interlaced.
 
     Among the pixels that move, even lines are compared with the odd lines around them, of the same image, the one
     before and the one after. The two fields of a progressive image are of one moment: they differ less from each other
     than from those of both neighbours. Of an interlaced one, whichever field comes first, a field of one neighbour is
     as near in time as that of the same image. Fast motion makes combs: neighbouring lines differ more than every
     second one.
+    """
+
+    def __init__(self) -> None:
+        self._window: list[np.ndarray] = []
+        self._totals = np.zeros(4)
+        self._triples = self._seen = 0
+
+    @property
+    def is_done(self) -> bool:
+        """True if no more images need to be looked at."""
+        return self._seen >= LOOKED_AT or self._triples >= _TRIPLES
+
+    def look(self, image: np.ndarray) -> None:
+        """Look at the next image.
+
+        Args:
+            image: ``(H, W, 3)`` or ``(H, W)`` uint8, neither turned nor resized.
+        """
+        if self.is_done:
+            return
+        self._seen += 1
+        grey = (image if image.ndim == 2 else image[..., 1]).astype(np.float32)  # green is nearest to luminance
+        grey = np.ascontiguousarray(grey[: len(grey) // 2 * 2, :: max(1, round(grey.shape[1] / _WIDTH))])
+        if not 8 <= len(grey) <= _HIGHEST:
+            self._seen = LOOKED_AT
+            return
+        self._window = [*self._window, grey][-3:]
+        if len(self._window) < 3 or len({part.shape for part in self._window}) > 1:
+            return
+        sums = _compared(*self._window)
+        if sums is not None:
+            self._totals += sums
+            self._triples += 1
+
+    @property
+    def is_interlaced(self) -> bool:
+        """True for interlaced images; False also where nothing has moved yet."""
+        if self._triples < _FEWEST:
+            return False
+        same, before, after, second = self._totals.tolist()
+        nearest, farthest = sorted((before, after))
+        is_told = farthest > _FURTHER * same  # of noise all fields are as far apart
+        return same > _ROUGH * second or (is_told and nearest - same < _NEAR * (farthest - same))
+
+
+def are_interlaced(images: Iterable[np.ndarray]) -> bool:
+    """Find out if images that follow each other are interlaced, see :class:`FieldTest`.
 
     Args:
-        images: ``(H, W, 3)`` or ``(H, W)`` uint8, in order, neither turned nor resized; the first 16 are read.
+        images: in order; the first 16 at most are read.
 
     Returns:
         True for interlaced ones; False also where nothing moves.
     """
-    totals = np.zeros(4)
-    count = 0
-    for sums in islice(_compared(islice(images, LOOKED_AT)), _TRIPLES):
-        totals += sums
-        count += 1
-    if count < _FEWEST:
-        return False
-    same, before, after, second = totals.tolist()
-    nearest, farthest = sorted((before, after))
-    is_told = farthest > _FURTHER * same  # of noise all fields are as far apart
-    return same > _ROUGH * second or (is_told and nearest - same < _NEAR * (farthest - same))
+    test = FieldTest()
+    for image in islice(images, LOOKED_AT):
+        test.look(image)
+        if test.is_done:
+            break
+    return test.is_interlaced
 
 
-def _compared(images: Iterable[np.ndarray]) -> Iterator[tuple[float, float, float, float]]:
+def _compared(last: np.ndarray, this: np.ndarray, following: np.ndarray) -> tuple[float, float, float, float] | None:
     """Sums of an image with motion: even lines against odd ones of the same, the last, the next; against even ones."""
     import cv2
 
-    window: list[np.ndarray] = []
-    for image in images:
-        grey = (image if image.ndim == 2 else image[..., 1]).astype(np.float32)  # green is nearest to luminance
-        grey = np.ascontiguousarray(grey[: len(grey) // 2 * 2, :: max(1, round(grey.shape[1] / _WIDTH))])
-        if not 8 <= len(grey) <= _HIGHEST:
-            return
-        window = [*window, grey][-3:]
-        if len(window) < 3 or len({part.shape for part in window}) > 1:
-            continue
-        last, this, following = window
-        moved = [cv2.boxFilter(np.abs(part - this), -1, (9, 9))[2:-2:2] > _MOVED for part in (last, following)]
-        if min(mask.mean() for mask in moved) < _SHARE:  # a repeated image, or the first that moves
-            continue
-        mask = moved[0] | moved[1]
-        even = this[2:-2:2]
-        odd = ((part[1:-3:2], part[3:-1:2]) for part in (this, last, following))
-        sums = [float((np.abs(even - upper) + np.abs(even - lower))[mask].sum()) for upper, lower in odd]
-        second = np.abs(even - this[:-4:2]) + np.abs(even - this[4::2])
-        yield sums[0], sums[1], sums[2], float(second[mask].sum())
+    moved = [cv2.boxFilter(np.abs(part - this), -1, (9, 9))[2:-2:2] > _MOVED for part in (last, following)]
+    if min(mask.mean() for mask in moved) < _SHARE:  # a repeated image, or the first that moves
+        return None
+    mask = moved[0] | moved[1]
+    even = this[2:-2:2]
+    odd = ((part[1:-3:2], part[3:-1:2]) for part in (this, last, following))
+    sums = [float((np.abs(even - upper) + np.abs(even - lower))[mask].sum()) for upper, lower in odd]
+    second = np.abs(even - this[:-4:2]) + np.abs(even - this[4::2])
+    return sums[0], sums[1], sums[2], float(second[mask].sum())

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.clock import PARTS
+from dvo.data.files.clock import PARTS, is_number
 from dvo.data.files.files import read_rows
 from dvo.data.readers.icl_nuim import read_counted_poses
 from dvo.data.readers.tartanair import read_ned_poses
 from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
+
+_WITHOUT_TIMES = (7, 12, 16)  # numbers of a row
 
 
 def read_groundtruth(file: Path, timestamps: np.ndarray | None) -> Trajectory:
@@ -45,13 +48,29 @@ def read_groundtruth(file: Path, timestamps: np.ndarray | None) -> Trajectory:
         if not inside.any():
             raise _no_times(len(poses), times, file)
         return Trajectory(np.asarray(times[numbers[inside]]), poses[inside])
-    if columns not in (7, 12, 16):
+    if columns not in _WITHOUT_TIMES or _has_header(file):
         return _on_clock(read_tum(file), timestamps)
     poses = read_ned_poses(file) if columns == 7 else read_kitti_poses(file, columns)
     times = np.zeros(0) if timestamps is None else timestamps
     if len(times) != len(poses):
         raise _no_times(len(poses), times, file)
     return Trajectory(np.asarray(times), poses)
+
+
+def rows_without_times(file: Path) -> int | None:
+    """Number of poses of a file whose rows are those of images, without times.
+
+    Args:
+        file: the poses.
+
+    Returns:
+        Rows of a KITTI or TartanAir file; None for a file with times.
+
+    Raises:
+        DvoError: the file cannot be read.
+    """
+    lengths = [len(fields) for _, fields in read_rows(file, "give an existing file", "groundtruth")]
+    return len(lengths) if lengths and lengths[0] in _WITHOUT_TIMES else None
 
 
 def _on_clock(found: Trajectory, timestamps: np.ndarray | None) -> Trajectory:
@@ -71,6 +90,12 @@ def _on_clock(found: Trajectory, timestamps: np.ndarray | None) -> Trajectory:
 def _columns(file: Path) -> int:
     """Numbers in the first row."""
     return next((len(fields) for _, fields in read_rows(file, "give an existing file", "groundtruth")), 0)
+
+
+def _has_header(file: Path) -> bool:
+    """True for a first row of names."""
+    rows = read_rows(file, "give an existing file", "groundtruth")
+    return not any(is_number(field) for _, fields in islice(rows, 1) for field in fields)
 
 
 def _no_times(rows: int, times: np.ndarray, file: Path) -> DvoError:

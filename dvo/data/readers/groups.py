@@ -109,10 +109,16 @@ def _by_words(images: Sequence[Path]) -> list[_Group]:
         group.files.append(image)
         group.numbers.append(tuple(re.findall(r"[0-9]+", image.stem)))
     found = list(groups.values())
+    if not any(group.role == "left" for group in found):  # r_7: a rendering
+        for group in found:
+            group.role = _role(group.files[0].stem, "r")
     if len(found) < 2 or len(found) > _FEW or any(len(group.files) < _LEAST for group in found):
         return []
     if {group.role for group in found} in ({"left", "right"}, {"colour", "depth"}, {"plain", "depth"}):
         return found
+    fewest = min(len(numbers) for group in found for numbers in group.numbers)
+    for group in found:
+        group.numbers = _varying(group.numbers, fewest)
     first = max(found, key=lambda group: len(group.files))
     numbers = set(first.numbers)
     shared = (
@@ -121,6 +127,12 @@ def _by_words(images: Sequence[Path]) -> list[_Group]:
         if group is not first
     )
     return found if all(shared) else []
+
+
+def _varying(rows: list[tuple[str, ...]], count: int) -> list[tuple[str, ...]]:
+    """Numbers of names without those that all names have, if there are more than so many (``r_7_depth_0001``)."""
+    kept = [k for k, column in enumerate(zip(*rows, strict=False)) if len(set(column)) > 1]
+    return [tuple(row[k] for k in kept) if len(row) > count and len(kept) == count else row for row in rows]
 
 
 def _by_camera(images: Sequence[Path]) -> list[_Group]:
@@ -157,8 +169,8 @@ def _with(texts: list[str], k: int, value: str) -> str:
     return "".join(text + mark for text, mark in zip(texts, [*marks, ""], strict=True))
 
 
-def _role(stem: str) -> str:
-    words = {word.lower() for word in _WORD.findall(re.sub(r"[0-9]+", " ", stem))}
+def _role(stem: str, without: str = "") -> str:
+    words = {word.lower() for word in _WORD.findall(re.sub(r"[0-9]+", " ", stem))} - {without}
     return next((role for role, names in _ROLES.items() if words & names), "plain")
 
 

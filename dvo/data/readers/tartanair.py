@@ -102,7 +102,7 @@ def read_ned_poses(path: Path) -> np.ndarray:
         ``(N, 7)`` float64 camera-to-world poses of the camera frame x right, y down, z forward.
 
     Raises:
-        DvoError: missing file, no rows, a row that is not 7 finite numbers, or a quaternion of no length.
+        DvoError: missing file, no rows, a row that is not 7 finite numbers, or a quaternion that is none.
     """
     table, numbers = read_numbers(path, 7, "row", "tx ty tz qx qy qz qw")
     table[:, 3:] = unit_quaternions(table[:, 3:], path, numbers)

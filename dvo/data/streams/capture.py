@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from dvo.core.errors import DvoError
 from dvo.core.text import first_line, redacted
 from dvo.data.files.stamps import NOMINAL_FPS, RATES
+from dvo.data.images.fields import INTERLACED_STREAM, FieldTest
 from dvo.data.images.images import to_rgb8
 from dvo.data.recording import RawFrame
 
@@ -100,6 +101,7 @@ class Capture:
     Attributes:
         name: address without user name, password and tokens.
         is_recording: a video file that is served, not a live stream.
+        warnings: sentences for the user; they grow while images are read.
         times: ``arrival``; ``stream``, those of an RTSP stream on the clock of this machine; ``file``, those of a video
             file that is served; or ``fps``.
 
@@ -111,6 +113,7 @@ class Capture:
         import cv2
 
         self.name, self._fps = shown(address), fps
+        self.warnings: list[str] = []
         self._capture = _open(address, self.name)
         webcam = WEBCAM.fullmatch(address) is not None
         if webcam:
@@ -134,12 +137,18 @@ class Capture:
         import cv2
 
         clock, index, previous, offset = StreamClock(), 0, -math.inf, 0.0
+        fields: FieldTest | None = FieldTest()
         try:
             while not stopped() and self._capture.grab():
                 arrival = time.monotonic()
                 stated = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
                 decoded, image = self._capture.retrieve()
                 if decoded and image is not None:
+                    if fields is not None:
+                        fields.look(image)
+                        if fields.is_done:
+                            self.warnings += [INTERLACED_STREAM] * fields.is_interlaced
+                            fields = None
                     if self.times in ("arrival", "stream"):
                         seconds = clock(arrival, stated if self.times == "stream" else None)
                     elif self.times == "file" and stated + offset > previous:

@@ -281,7 +281,9 @@ def _of_capture(
         raise DvoError("neither a camera nor an address", file=shown(address), remedy=remedy)
     capture = Capture(address, fps)
     live = _live(capture.images(stopped.is_set), capture.name, capture.is_recording, queue, stopped)
-    return LiveRecording(live, lambda raw: raw, capture.times), _FIRST
+    recording = LiveRecording(live, lambda raw: raw, capture.times)
+    recording.warnings = capture.warnings
+    return recording, _FIRST
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ class Limits:
             that confirm each other.
         translation, rotation, scale: largest differences of the corrections of two loops that confirm each other, in
             median depths, degrees, and as a ratio less one; largest corrections of a loop with few inliers.
+        corner_scale: largest difference of the scale of such a loop from that of corners, as a ratio less one: it comes
+            from the depths of few patches, and the loop that confirms it has to agree within ``scale``.
     """
 
     inliers: float = 0.4
@@ -30,6 +32,7 @@ class Limits:
     translation: float = 0.2
     rotation: float = 3.0
     scale: float = 0.1
+    corner_scale: float = 0.5
 
 
 def is_loop(match: Match, pair: Pair, limits: Limits = Limits()) -> bool:  # noqa: B008 (frozen)
@@ -57,7 +60,8 @@ def is_loop(match: Match, pair: Pair, limits: Limits = Limits()) -> bool:  # noq
     moved = se3.relative(pair.present_cw, match.poses_cw[len(pair.old) + later])
     far = float(moved[:3].norm()) * median_inverse_depth(pair.new[later])
     angle, scale = float(so3.angle(moved[3:]).rad2deg()), max(match.scale, 1 / match.scale) - 1
-    return far <= limits.translation and angle <= limits.rotation and scale <= limits.scale
+    most = limits.corner_scale if pair.joins else limits.scale
+    return far <= limits.translation and angle <= limits.rotation and scale <= most
 
 
 def median_inverse_depth(keyframe: ArchivedKeyframe) -> float:

@@ -311,6 +311,113 @@ def transforms(frames=({},), **values):
     return json.dumps({**values, "aabb_scale": 16, "frames": rows})
 
 
+MIDDLEBURY = """cam0=[500 0 320; 0 510 240; 0 0 1]
+cam1=[500 0 {}; 0 510 240; 0 0 1]
+doffs={}
+baseline=193.001
+width=640
+height=480
+ndisp=280
+isint=0
+vmin=31
+dyavg=0
+"""
+REALSENSE = """Intrinsic Parameters:
+
+ Intrinsic of "Depth" / 640x480 / {{Z16}}
+  Width:      \t640
+  Height:     \t480
+  PPX:        \t324.033264160156
+  PPY:        \t233.439270019531
+  Fx:         \t390.25830078125
+  Fy:         \t390.25830078125
+  Distortion: \tBrown Conrady
+  Coeffs:     \t0  \t0  \t0  \t0  \t0
+  FOV (deg):  \t78.7 x 63.17
+
+ Intrinsic of "Color" / 640x480 / {{YUYV/RGB8/BGR8/RGBA8/BGRA8/Y8}}
+  Width:      \t640
+  Height:     \t480
+  PPX:        \t320
+  PPY:        \t240
+  Fx:         \t500
+  Fy:         \t510
+  Distortion: \t{}
+  Coeffs:     \t{}
+  FOV (deg):  \t70.07 x 43.05
+
+Extrinsic from "Depth"\t  To\t  "Color" :
+ Rotation Matrix:
+   0.99982          0.0182547        0.00521857
+"""
+SHOWN = "[ 640x480  p[320 240]  f[500 510]  {} [0.1 -0.2 0.003 0.004 0.05] ]"
+BOUGUET = """% Intrinsic and Extrinsic Camera Parameters
+%-- Focal length:
+fc = [ 500.000000000000000 ; 510.000000000000000 ];
+cc = [ 320.000000000000000 ; 240.000000000000000 ];
+alpha_c = {};
+kc = [ 0.1 ; -0.2 ; 0.003 ; 0.004 ; 0.05 ];
+fc_error = [ 0.35 ; 0.37 ];
+kc_error = [ 0.002 ; 0.011 ; 0.0001 ; 0.0001 ; 0.0 ];
+nx = 640;
+ny = 480;
+n_ima = 20;\t\t% Number of calibration images
+est_dist = [ 1 ; 1 ; 1 ; 1 ; 0 ];\t% Estimation indicator of the distortion coefficients
+%-- Image #1:
+omc_1 = [ -7.925019e-001 ; 5.895213e-001 ; 1.453934e+000 ];
+Tc_1  = [ 1.796143e+002 ; -6.509156e+001 ; 8.940399e+002 ];
+"""
+STEREO_BOUGUET = """fc_left = [ 500 ; 510 ];
+cc_left = [ 320 ; 240 ];
+alpha_c_left = 0;
+kc_left = [ 0.1 ; -0.2 ; 0.003 ; 0.004 ; 0.05 ];
+fc_right = [ 400 ; 410 ];
+cc_right = [ 321 ; 241 ];
+kc_right = [ 0 ; 0 ; 0 ; 0 ; 0 ];
+T = [ -99.84929   0.82221 ...
+      0.43647 ];
+"""
+MATLAB = {"RadialDistortion": [0.1, -0.2, 0.05], "TangentialDistortion": [0.003, 0.004], "ImageSize": [480, 640],
+          "WorldUnits": "mm", "EstimateSkew": 0, "NumRadialDistortionCoefficients": 3, "Version": "9.1",
+          "EstimateTangentialDistortion": True,
+          "IntrinsicMatrix": [[500, 0, 0], [0, 510, 0], [321, 241, 1]]}  # fmt: skip
+DISPLAYED = """
+  cameraIntrinsics with properties:
+
+             FocalLength: [500 510]
+          PrincipalPoint: [321 241]
+               ImageSize: [480 640]
+        RadialDistortion: [0.1000 -0.2000]
+    TangentialDistortion: [0 0]
+                    Skew: 0
+                       K: [3x3 double]
+"""
+
+
+def meshroom(version, kind, parameters, camera=(), **more):
+    intrinsic = {"intrinsicId": "2390361049", "width": "640", "height": "480", "sensorWidth": "32",
+                 "sensorHeight": "24", "type": kind, "principalPoint": ["320", "240"], "pxFocalLength": "500",
+                 "distortionParams": [str(value) for value in parameters], **dict(camera)}  # fmt: skip
+    view = {"viewId": "1", "intrinsicId": "2390361049", "path": "a.jpg", "metadata": {"Exif:f": "5"}}
+    return json.dumps({"version": version.split("."), "views": [view], "intrinsics": [intrinsic], **more})
+
+
+def openmvg(*cameras):
+    """As cereal writes them: the name of a type with its first camera alone."""
+    written, types = [], {}
+    for key, (name, data) in enumerate(cameras):
+        number = types.setdefault(name, len(types) + 1)
+        is_first = number == len(types) and name not in [one for one, _ in cameras[:key]]
+        value = {"polymorphic_id": number + (2**31 if is_first else 0)} | (
+            {"polymorphic_name": name} if is_first else {}
+        )
+        written.append({"key": key, "value": {**value, "ptr_wrapper": {"id": 2**31 + key, "data": data}}})
+    return json.dumps({"sfm_data_version": "0.3", "root_path": "", "views": [], "intrinsics": written, "structure": []})
+
+
+LATER = {"focalLength": "25", "principalPoint": ["0", "0"], "pixelRatio": "1.02"}
+MVG = {"width": 640, "height": 480, "focal_length": 500.0, "principal_point": [320.0, 240.0]}
+SQUARE = (500, 500, 320, 240)
 NUMBERS = (500, 510, 320, 240)
 FULL = {"fl_x": 500, "fl_y": 510, "cx": 320.5, "cy": 240.5, "w": 640, "h": 480}
 READ = [
@@ -429,6 +536,52 @@ READ = [
     ("attributes.xml", '<camera model="fisheye" width="640" height="480"><fx>500</fx><fy>510</fy>'
      "<cx>320</cx><cy>240</cy><d>.1 -.2 .003 .004</d></camera>", NUMBERS, "fisheye", KC, (640, 480)),
     ("profile.json", json.dumps(GYROFLOW), NUMBERS, "fisheye", KC, (640, 480)),
+    ("middlebury.txt", MIDDLEBURY.format(320, 0), NUMBERS, "none", (), (640, 480)),
+    ("realsense.txt", REALSENSE.format("Inverse Brown Conrady", "0 0 0 0 0"), NUMBERS, "none", (), (640, 480)),
+    ("realsense_lens.txt", REALSENSE.format("Brown Conrady", "0.1 \t-0.2 \t0.003 \t0.004 \t0.05"), NUMBERS, "radtan",
+     FIVE, (640, 480)),
+    ("realsense_wide.txt", REALSENSE.format("Kannala Brandt4", "0.1 -0.2 0.003 0.004 0"), NUMBERS, "fisheye", KC,
+     (640, 480)),
+    ("realsense_line.txt", SHOWN.format("Brown Conrady"), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("Calib_Results.m", BOUGUET.format("0.000000000000000"), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("Calib_Results.txt", BOUGUET.format("0"), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("Calib_Results_stereo.m", STEREO_BOUGUET, NUMBERS, "radtan", FIVE, (None, None)),
+    ("own.m", "K = [500 0 320; 0 510 240; 0 0 1];\ndist = [0.1, -0.2, 0.003, 0.004, 0.05]; % k1 k2 p1 p2 k3\n", NUMBERS,
+     "radtan", FIVE, (None, None)),
+    ("matlab.json", json.dumps(MATLAB), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("matlab_k.json", json.dumps({"params": {**MATLAB, "K": [[500, 0, 321], [0, 510, 241], [0, 0, 1]],
+     "IntrinsicMatrix": None}}), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("matlab_stereo.json", json.dumps({"CameraParameters1": MATLAB, "CameraParameters2": {**MATLAB,
+     "RadialDistortion": [0, 0]}}), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("matlab.txt", DISPLAYED, NUMBERS, "radtan", (0.1, -0.2, 0, 0, 0), (640, 480)),
+    ("entries.yaml", f"- K: {ROWS}\n- D: [{list(FIVE)}]\n- R: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n- t: [[1], [2]]\n",
+     NUMBERS, "radtan", FIVE, (None, None)),
+    ("twice.yaml", PINHOLE + f"distortion: {{k1: 0.1, k2: -0.2, p1: 0.003, p2: 0.004, k3: 0.05}}\nD: {list(FIVE)}\n",
+     NUMBERS, "radtan", FIVE, (None, None)),
+    ("photonvision.json", json.dumps({"resolution": {"width": 640, "height": 480}, "cameraIntrinsics": {"rows": 3,
+     "cols": 3, "type": 6, "data": json.loads(MATRIX)}, "distCoeffs": {"rows": 1, "cols": 8, "type": 6, "data": EIGHT},
+     "observations": []}), NUMBERS, "radtan", EIGHT, (640, 480)),
+    ("radial.yaml", PINHOLE + f"model: fisheye\nradial_distortion: {list(KC)}\n", NUMBERS, "fisheye", KC, (None, None)),
+    ("apart.yaml", PINHOLE + "radial_distortion: [0.1, -0.2, 0.05]\ntangential_distortion: [0.003, 0.004]\n", NUMBERS,
+     "radtan", FIVE, (None, None)),
+    ("apart.json", json.dumps({"fx": 500, "fy": 510, "cx": 320, "cy": 240, "distortion": {"radial": [0.1, -0.2],
+     "tangential": [0.003, 0.004]}}), NUMBERS, "radtan", (*KC, 0), (None, None)),
+    ("cameras.sfm", meshroom("1.0.0", "radial3", FIVE[:3]), SQUARE, "radtan", (0.1, -0.2, 0, 0, 0.003), (640, 480)),
+    ("sfm.json", meshroom("1.2.1", "brown", [0.1, -0.2, 0.05, 0.003, 0.004],
+     {"pxFocalLength": ["500", "510"], "principalPoint": ["0", "0"]}), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("pixel_ratio.sfm", meshroom("1.2.4", "pinhole", [], {**LATER, "pixelRatio": str(1 / 1.02)}), NUMBERS, "none", (),
+     (640, 480)),
+    ("later.sfm", meshroom("1.2.6", "radial1", [0.1], LATER), NUMBERS, "radtan", (0.1, 0, 0, 0), (640, 480)),
+    ("latest.sfm", meshroom("1.2.12", "pinhole", KC, LATER | {"distortionType": "fisheye4"}), NUMBERS, "fisheye", KC,
+     (640, 480)),
+    ("sfm_data.json", openmvg(("pinhole_radial_k3", MVG | {"disto_k3": [0.1, -0.2, 0.05]})), SQUARE, "radtan",
+     (0.1, -0.2, 0, 0, 0.05), (640, 480)),
+    ("two_terms.json", openmvg(("pinhole_radial_k3", MVG | {"disto_k3": [0.1, -0.2]})), SQUARE, "radtan",
+     (0.1, -0.2, 0, 0, 0), (640, 480)),
+    ("brown.json", openmvg(*[("pinhole_brown_t2", {"value0": MVG, "disto_t2": [0.1, -0.2, 0.05, 0.003, 0.004]})] * 2),
+     SQUARE, "radtan", FIVE, (640, 480)),
+    ("fisheye.json", openmvg(("fisheye", MVG | {"fisheye": KC})), SQUARE, "fisheye", KC, (640, 480)),
+    ("pinhole.json", openmvg(("pinhole", MVG)), SQUARE, "none", (), (640, 480)),
     ("calib_cam_to_cam.txt", KITTI_RAW, (721.5377, 721.5377, 609.5593, 172.854), "none", (), (1242, 375)),
     ("kitti_recorded.txt", KITTI_RAW.replace("_rect", "_left"), (984.2439, 980.8141, 690, 233.1966), "radtan",
      (-0.3728755, 0.2037299, 0.002219027, 0.001383707, -0.07233722), (1392, 512)),
@@ -573,6 +726,31 @@ REFUSED = [
      "<cx>3.5</cx><cy>4.5</cy></calibration></sensor></a>", "an offset from their centre"),
     ("centre.yaml", "fx: 500\nfy: 510\ncx: 0.5\ncy: 0.5\nwidth: 640\nheight: 480\n", "or a share of the size"),
     ("centre.txt", "500 510 0.5 0.5", "a share of the size"),
+    ("middlebury.txt", MIDDLEBURY.format(320, 0).replace("193.001", "wide"), "baseline: no numbers: 'wide'"),
+    ("middlebury.txt", MIDDLEBURY.format(320, 0).replace("cam0", "cam1", 1), "cam1: twice in it"),
+    ("middlebury.txt", MIDDLEBURY.format(320, 0).replace("[500 0", "[500 1"), "skew"),
+    ("realsense.txt", REALSENSE.format("Inverse Brown Conrady", "0.1 0 0 0 0"), "Inverse Brown Conrady"),
+    ("realsense.txt", REALSENSE.format("Brown Conrady", "none"), "coefficients: no number: 'none'"),
+    ("realsense.txt", REALSENSE.format("", "").split("  Fx")[0], 'Intrinsic of "Depth": no fx, fy, model, coeffi'),
+    ("realsense.txt", REALSENSE.format("Brown Conrady", "0 0 0 0 0") * 2, "4 cameras in it: 0: Depth 640x480, 1: Col"),
+    ("realsense.txt", SHOWN.format("F-Theta"), "F-Theta"),
+    ("Calib_Results.m", BOUGUET.format("0.01"), "skew"),
+    ("own.m", "x = 3;\n", "no fx, fy, cx, cy in it, nor a camera matrix: x"),
+    ("matlab.json", json.dumps({**MATLAB, "IntrinsicMatrix": [[500, 0, 0], [3, 510, 0], [320, 240, 1]]}), "skew"),
+    ("matlab.json", json.dumps({**MATLAB, "PrincipalPoint": 3, "IntrinsicMatrix": None, "FocalLength": [500, 510]}),
+     "PrincipalPoint: no two numbers"),
+    ("cameras.sfm", meshroom("1.2.6", "3declassicld", KC, LATER), "type: '3declassicld' is not read"),
+    ("cameras.sfm", meshroom("1.2.6", "equidistant", [], LATER | {"distortionType": "radialk3"}), "'equidistant'"),
+    ("cameras.sfm", meshroom("1.2.6", "radial1", KC, LATER), "distortionParams: 4 coefficients of radial1"),
+    ("cameras.sfm", meshroom("1.0", "pinhole", []), "version: no version of three numbers"),
+    ("cameras.sfm", meshroom("1.0.0", "pinhole", [], {"pxFocalLength": "x"}), "pxFocalLength: no number: 'x'"),
+    ("cameras.sfm", meshroom("1.2.6", "pinhole", [], LATER | {"sensorWidth": "0"}), "sensorWidth, pixelRatio"),
+    ("cameras.sfm", meshroom("1.0.0", "pinhole", [], intrinsics={}), "intrinsics: no list of cameras"),
+    ("sfm_data.json", openmvg(("spherical", {"width": 640, "height": 320})), "'spherical' is not read"),
+    ("sfm_data.json", openmvg(("pinhole", MVG | {"disto_k1": [0.1]})), "disto_k1: not of the type pinhole"),
+    ("sfm_data.json", openmvg(("pinhole", MVG), ("pinhole", MVG | {"focal_length": 400})), "2 cameras in it: 0: 0,"),
+    ("sfm_data.json", openmvg(), "no camera in it"),
+    ("sfm_data.json", openmvg(("pinhole_brown_t2", MVG | {"disto_t2": "x"})), "disto_t2: expected 5 numbers"),
     ("meshroom.json", json.dumps({"intrinsics": [{"width": "640", "height": "480", "sensorWidth": "36",
      "type": "pinhole", "focalLength": "29.5", "principalPoint": ["320", "240"], "distortionParams": ""}]}),
      "sensorWidth.*millimetres"),
@@ -580,6 +758,11 @@ REFUSED = [
      "sensor_width.*millimetres"),
     ("unit.yaml", "fx: 25\nfy: 25\ncx: 18\ncy: 12\nunits: mm\n", "units: 'mm'"),
     ("distorted.yaml", PINHOLE + "k1: 0.1\nk2: 0.2\np1: 0\np2: 0\ndistorted: False\n", "distorted: false, but"),
+    ("a2d2.json", json.dumps({"CamMatrix": [[400, 0, 320], [0, 410, 240], [0, 0, 1]], "CamMatrixOriginal":
+     [[500, 0, 320], [0, 510, 240], [0, 0, 1]], "Distortion": [KC], "Lens": "Fisheye", "Resolution": [640, 480]}),
+     "CamMatrixOriginal: is another matrix of a camera with a lens"),
+    ("twice.yaml", PINHOLE + f"distortion: {{k1: 0.1, k2: -0.3}}\nD: {list(FIVE)}\n", "distortion.k2"),
+    ("radial.yaml", PINHOLE + f"radial_distortion: {list(KC)}\n", "radial_distortion may be lens distortion"),
     ("new.yaml", f"new_camera_matrix: {ROWS}\ndist: {list(FIVE)}\n", "that of undistorted images"),
     ("stated.yaml", "fx: 50\nfy: 50\ncx: 320\ncy: 240\nwidth: 640\nheight: 480\n", "fx=50 does not fit"),
     ("profile.json", json.dumps(GYROFLOW | {"digital_lens": "gopro_superview"}), "digital_lens: 'gopro_superview'"),
@@ -655,6 +838,28 @@ def test_a_camera_of_several_by_its_number(make):
     assert read_calibration(f"{raw}:2").fx == 731.5377
     with pytest.raises(DvoError, match="2 cameras in it: 0, 2"):
         read_calibration(raw)
+
+
+def test_a_stream_of_realsense_and_a_camera_of_a_scene_by_its_number(make):
+    dump = make.text("d435.txt", REALSENSE.format("Inverse Brown Conrady", "0.1 0 0 0 0"))
+    depth = read_calibration(f"{dump}:0")
+    assert depth.fx == 390.25830078125 and depth.ignored == ("Color 640x480",)
+    scene = make.text("sfm_data.json", openmvg(("pinhole", MVG), ("pinhole", MVG | {"focal_length": 400})))
+    assert read_calibration(f"{scene}:1").fx == 400
+    with pytest.raises(DvoError, match="no camera 2 in it"):
+        read_calibration(f"{scene}:2")
+    stereo = make.text("stereo.json", json.dumps({"CameraParameters1": MATLAB, "CameraParameters2": {**MATLAB,
+                       "RadialDistortion": [0, 0], "TangentialDistortion": [0, 0]}}))  # fmt: skip
+    assert read_calibration(f"{stereo}:2").model == "none"
+
+
+def test_the_baseline_of_middlebury_is_in_millimetres_and_needs_equal_principal_points(make):
+    same = read_calibration(make.text("a.txt", MIDDLEBURY.format(320, 0)))
+    assert same.baseline == pytest.approx(0.193001) and not same.notes and same.ignored[:2] == ("cam1", "ndisp")
+    shifted = make.text("b.txt", MIDDLEBURY.format(451.111, 131.111))
+    assert read_calibration(shifted).baseline is None and "doffs=131.111" in read_calibration(shifted).notes[0]
+    right = read_calibration(f"{shifted}:1")
+    assert (right.cx, right.baseline, right.notes) == (451.111, None, ())
 
 
 def test_stereo_files_of_orb_slam_say_which_camera_is_read(make):

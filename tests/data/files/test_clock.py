@@ -75,6 +75,10 @@ HEADERS = {
         "33333333,1,2,3,.9,.1,.2,.3,8",
     "%time,field.pose.position.x,field.pose.position.y,field.pose.position.z,field.pose.orientation.x,"
     "field.pose.orientation.y,field.pose.orientation.z,field.pose.orientation.w": "33333333,1,2,3,.1,.2,.3,.9",
+    "sec,nsec,x,y,z,qx,qy,qz,qw": "0,33333333,1,2,3,.1,.2,.3,.9",
+    "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.child_frame_id,field.pose.pose.position.x,"
+    "field.pose.pose.position.y,field.pose.pose.position.z,field.pose.pose.orientation.x,field.pose.pose.orientation.y,"
+    "field.pose.pose.orientation.z,field.pose.pose.orientation.w": "99,7,33333333,map,camera,1,2,3,.1,.2,.3,.9",
 }  # fmt: skip
 
 
@@ -82,7 +86,7 @@ HEADERS = {
 def test_poses_under_a_header(make, header):
     later = HEADERS[header].replace("33333333,", "66666667,").replace(".033333333", ".066666667")
     later = later.replace("33333.333", "66666.667")
-    found = read_tum(make.text("t.csv", f"{header}\n{HEADERS[header]}\n{later}\n"))
+    found = read_groundtruth(make.text("t.csv", f"{header}\n{HEADERS[header]}\n{later}\n"), np.zeros(2))
     np.testing.assert_allclose(found.timestamps, [1 / 30, 2 / 30], atol=1e-8)
     quaternion = np.array([0.1, 0.2, 0.3, 0.9]) / np.sqrt(0.95)
     np.testing.assert_allclose(found.poses_wc, [[1, 2, 3, *quaternion]] * 2, atol=1e-12)
@@ -133,6 +137,20 @@ def test_quotes_around_fields(make):
 def test_headers_without_a_pose_are_named(make, header):
     with pytest.raises(DvoError, match="header: the header .* does not name a time, a position and a quaternion"):
         read_tum(make.text("t.csv", f"{header}\n1,2,3,4,5,6,7,8\n"))
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("t,tcw_x,tcw_y,tcw_z,qx,qy,qz,qw", "column 'tcw_x': poses of the world in the camera"),
+        ("t,x,y,z,q_cw_x,q_cw_y,q_cw_z,q_cw_w", "column 'q_cw_x': poses of the world in the camera"),
+        ("t,gt_x,gt_y,gt_z,gt_qx,gt_qy,gt_qz,gt_qw,x,y,z,qx,qy,qz,qw", "two trajectories, 'gt_x' and 'x'"),
+    ],
+)
+def test_headers_of_other_poses_are_refused(make, header, said):
+    row = ",".join(["0", *["1,2,3,0,0,0,1"] * (header.count(",") // 7)])
+    with pytest.raises(DvoError, match=said):
+        read_tum(make.text("t.csv", f"{header}\n{row}\n"))
 
 
 def test_an_empty_field_shifts_no_columns(make):

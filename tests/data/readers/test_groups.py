@@ -54,6 +54,13 @@ def test_the_stream_of_colour_or_the_left_one_is_tracked(make, patterns, option)
             assert np.array_equal(frames[2].right.image, make.image(2)[..., ::-1])
 
 
+def test_a_number_that_all_names_of_a_stream_have(make):
+    folder = write(make, "renderings", "r_{}.png", "r_{}_depth_0001.png", "r_{}_normal_0001.png")
+    source = dvo.open(folder, calib=make.calib(), fps=10)
+    assert [path.name for path in source.recording.images] == [f"r_{i}.png" for i in range(4)]
+    assert "r_*_depth_*.png (4) for --depth" in source.warnings[0]
+
+
 @pytest.mark.parametrize(
     ("folder", "beside", "units"),
     [("results", "traj.txt", 6553.5), ("results", "other.txt", 1000), ("clip", "traj.txt", 1000)],

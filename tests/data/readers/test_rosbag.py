@@ -9,10 +9,12 @@ import pytest
 import dvo
 from dvo.cli import main
 from dvo.core.errors import DvoError
+from dvo.data.calibration.calibration import Calibration
 from dvo.data.companions.depth_source import with_depth
 from dvo.data.companions.right_source import with_right
 from dvo.data.readers.ros_images import decode_message
 from dvo.data.readers.rosbag import calibration_of_info, matches, split_topic
+from tests.support.interlaced import moving, woven
 from tests.support.rosbags import PLUMB, Bag, P
 
 
@@ -307,3 +309,15 @@ def test_images_of_a_region_of_the_sensor(tmp_path, region, principal, size):
     )
     found = calibration_of_info(info, "image_raw", tmp_path / "a.bag")
     assert (found.cx, found.cy, found.width, found.height) == (*principal, *size)
+
+
+@pytest.mark.parametrize(("interlaced", "dropped"), [(True, ()), (False, ()), (False, (2, 5, 6, 9, 10, 11))])
+def test_interlaced_messages(tmp_path, interlaced, dropped):
+    """Also if messages were dropped, so that the images before and after are not equally far."""
+    images = list(woven(moving(32, 2), True)) if interlaced else list(moving(24, 2))
+    with Bag(tmp_path / "bag.bag", "bag") as bag:
+        for index, image in enumerate(images):
+            if index not in dropped:
+                bag.image("/image", image, 100 + 0.04 * index)
+    warnings = dvo.open(tmp_path / "bag.bag", calib=Calibration(300, 300, 159.5, 119.5)).warnings
+    assert any("interlaced" in said for said in warnings) == interlaced

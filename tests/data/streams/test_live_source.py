@@ -19,6 +19,7 @@ import dvo
 from dvo.core.errors import DvoError
 from dvo.data.streams.capture import Capture, StreamClock, is_stream, shown
 from dvo.data.streams.live_source import LiveSource, open_stream
+from tests.support.interlaced import moving, woven
 
 CALIB = "50 51 31 23\n"
 
@@ -144,6 +145,18 @@ def test_a_slow_consumer_gets_the_newest_frames(camera, make):
 def test_images_that_do_not_decode_are_left_out(camera, make):
     camera.images[4] = None
     assert [f.index for f in open_stream("webcam:0", calib=make.calib(), queue=0)] == [0, 1, 2, 3, *range(5, 12)]
+
+
+@pytest.mark.parametrize("interlaced", [True, False])
+def test_a_converter_of_analogue_video(camera, make, interlaced):
+    """The note comes while frames are read, of all received ones: the consumer sees the newest alone."""
+    camera.images = list(woven(moving(32, 2), True)) if interlaced else list(moving(16, 2))
+    calib = make.text("calib.txt", "300 300 159.5 119.5")
+    with open_stream("webcam:0", calib=calib) as source:
+        while not camera.last.released:
+            time.sleep(0.001)
+        assert len(list(source)) == 1
+        assert any("interlaced" in said and "bwdif" in said for said in source.warnings) == interlaced
 
 
 def test_without_a_calibration_the_angle_of_view_is_assumed(camera):

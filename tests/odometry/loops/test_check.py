@@ -38,16 +38,23 @@ class Visits:
     old: tuple[Archived, ...] = (Archived(1), Archived(2), Archived(3))
     new: tuple[Archived, ...] = (Archived(10), Archived(11), Archived(12))
     candidate: Wanted = Wanted()
+    joins: bool = False
 
 
-def judged(inliers, turn=0.0, shift=0.0, scale=1.0, other_world=False, present=(0.3, -0.2, 1.0, 0.4, 0.1, -0.3)):
-    """Decision for a later visit, found turned (degrees) and moved (median depths) against its present pose."""
+def judged(
+    inliers, turn=0.0, shift=0.0, scale=1.0, other_world=False, corners=False, present=(0.3, -0.2, 1.0, 0.4, 0.1, -0.3)
+):
+    """Decision for a later visit, found turned (degrees) and moved (median depths) against its present pose.
+
+    In another world there is none, or that of corners.
+    """
     present = se3.exp(torch.tensor(present, dtype=torch.float64))
     change = torch.tensor([0, 0, shift * DEPTH, 0, 0, 0], dtype=torch.float64)
     angle = torch.tensor([0, 0, 0, 0, math.radians(turn), 0], dtype=torch.float64)
     poses = se3.identity(6, dtype=torch.float64).clone()
     poses[4] = se3.compose(se3.exp(change), se3.compose(se3.exp(angle), present))  # the second of the newer group
-    return is_loop(Match(inliers, poses, scale, None, None), Visits(None if other_world else present), OPTIONS)
+    known = None if other_world and not corners else present
+    return is_loop(Match(inliers, poses, scale, None, None), Visits(known, joins=other_world), OPTIONS)
 
 
 def test_many_inliers_suffice():
@@ -68,6 +75,13 @@ def test_many_inliers_suffice():
 )
 def test_with_few_inliers_the_present_pose_has_to_agree(right, wrong):
     assert judged(**{"inliers": 0.3, **right}) and not judged(**{"inliers": 0.3, **wrong})
+
+
+def test_corners_tell_the_pose_closely_and_the_scale_roughly():
+    ahead = {"inliers": 0.2, "other_world": True, "corners": True}
+    assert judged(**ahead, scale=1.45) and judged(**ahead, scale=1 / 1.45) and not judged(**ahead, scale=1.55)
+    assert judged(**ahead, turn=2.9) and not judged(**ahead, turn=3.1)
+    assert judged(**ahead, shift=0.19) and not judged(**ahead, shift=0.21)
 
 
 @given(st.tuples(*[st.floats(-2, 2)] * 6), st.floats(-0.3, 0.3), st.floats(-5, 5))

@@ -4,9 +4,7 @@ The residual of an edge is ``e = chart(M_ij T_i T_j^-1)`` for a measurement ``M_
 information matrix; with the chart "log" that of :class:`dvo.ba.factors.RelativePose`. With camera-to-world poses
 ``X = T^-1`` and ``Z_ij = M_ij^-1`` it is ``chart(Z_ij^-1 X_i^-1 X_j)``, the error of g2o (Kuemmerle et al., "g2o: a
 general framework for graph optimization", 2011). In Sim(3) each pose has a scale of its own, so that a loop can correct
-drift of scale (Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", 2010). Where gravity and
-scale are known, as with inertial samples, only position and heading of a pose are unknown (Qin, Li and Shen,
-"VINS-Mono", 2018, VIII-C).
+drift of scale (Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", 2010).
 
 Poses of a trajectory that drifted far lie in the basin of a poor local minimum. The problem is therefore started from
 the poses given, from those of a spanning tree or from a linear relaxation, whichever cost least.
@@ -56,8 +54,6 @@ class PoseGraphOptions:
             where SciPy is installed, else "tiles".
         start: "best" is that of least chi2 of the poses given, a spanning tree and a linear relaxation; "given" keeps
             to the poses given.
-        gravity: ``(3,)`` direction in the world, of any length. Each pose then moves by a translation and a turn about
-            it alone: roll, pitch and scale stay those given. None: all coordinates are free.
     """
 
     fixed: int | Tensor | Sequence[bool] = 1
@@ -65,16 +61,10 @@ class PoseGraphOptions:
     kernel: Kernel = field(default_factory=Kernel)
     solver: LMOptions = field(default_factory=lambda: LMOptions(max_iterations=100, damping=1e-12, decrease=0.1))
     start: Literal["best", "given"] = "best"
-    gravity: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_kind(self.kernel, "kernel", Kernel)
         check_kind(self.solver, "solver", LMOptions)
-        if self.gravity is not None:
-            check_tensor(self.gravity, "gravity", REAL, None)
-            if self.gravity.shape != (3,):
-                raise DvoError(f"has shape {tuple(self.gravity.shape)}", field="gravity", remedy="give (3,)")
-            check_within(torch.linalg.vector_norm(self.gravity.double()), "length of gravity", 1e-8)
 
 
 LOOP_OPTIONS = PoseGraphOptions(solver=LMOptions(max_iterations=100, damping=1e-6, solver="tiles"), start="given")
@@ -141,8 +131,7 @@ def optimise_pose_graph(
     with torch.no_grad(), full_precision(poses_cw.device):
         measurements = measurements.to(poses_cw)
         full = _full_information(information, dim, len(ii))
-        gravity = None if options.gravity is None else _unit(options.gravity.to(poses_cw))
-        plane = gravity is None and in_plane(poses_cw, measurements, full)
+        plane = in_plane(poses_cw, measurements, full)
         axes = list(PLANE) if plane else list(range(dim))
         root = None
         if full is not None:
@@ -176,11 +165,8 @@ def optimise_pose_graph(
                 e, j_i, j_j = residuals_and_jacobians(poses, ii, jj, measurements, options.chart)
             if root is not None:
                 e, j_i, j_j = (root @ e[..., None])[..., 0], root @ j_i, root @ j_j
-            if gravity is not None:
-                ways = _upright_ways(poses, gravity)
-                j_i, j_j = j_i @ ways[ii], j_j @ ways[jj]
             weight = options.kernel.slope(e.square().sum(-1, keepdim=True)).expand_as(e)
-            zeros, unknowns = poses.new_zeros, j_i.shape[-1]
+            zeros, unknowns = poses.new_zeros, len(axes)
             system = SparseSystem(
                 pattern, zeros(pattern.h_pp.count, unknowns, unknowns), zeros(0, unknowns), zeros(0),
                 zeros(free, unknowns), zeros(0), False,
@@ -192,10 +178,7 @@ def optimise_pose_graph(
             change = step[0]
             if plane:
                 change = change.new_zeros(free, dim).index_copy_(1, torch.tensor(axes, device=change.device), change)
-            change = torch.nn.functional.pad(change, (0, 0, 0, 1))[slot]
-            if gravity is not None:
-                change = (_upright_ways(poses, gravity) @ change[..., None])[..., 0]
-            moved = group.retract(poses, change)
+            moved = group.retract(poses, torch.nn.functional.pad(change, (0, 0, 0, 1))[slot])
             return torch.where((slot == free)[:, None], poses, moved)
 
         begin, initial = poses_cw, None
@@ -209,7 +192,6 @@ def optimise_pose_graph(
             candidates: tuple[tuple[Start, Tensor], ...] = (("tree", tree.poses), ("relaxation", loose))
             for name, poses in candidates:
                 poses = flattened(poses) if plane else poses
-                poses = poses if gravity is None else _made_upright(poses, poses_cw, gravity)
                 found = cost(poses)
                 if found < least:  # False for NaN
                     begin, start, least = poses, name, found
@@ -247,33 +229,6 @@ def residuals_and_jacobians(
     by_right = _chart_jacobian(error, e, chart)
     adjoint = se3.adjoint(motion) if e.shape[-1] == 6 else sim3.adjoint(motion)
     return e, by_right @ adjoint, -by_right
-
-
-def _upright_ways(poses_cw: Tensor, gravity: Tensor) -> Tensor:
-    """Tangents ``(N, D, 4)`` of a shift in the axes of the camera and of a turn about gravity ``(3,)``.
-
-    Gravity is ``R g`` there, and ``Exp(psi R g) R = R Exp(psi g)`` leaves it as it is.
-    """
-    ways = poses_cw.new_zeros(len(poses_cw), poses_cw.shape[-1] - 1, 4)
-    ways[:, range(3), range(3)] = 1
-    ways[:, 3:6, 3] = so3.rotate(poses_cw[:, 3:7], gravity)
-    return ways
-
-
-def _made_upright(poses_cw: Tensor, given_cw: Tensor, gravity: Tensor) -> Tensor:
-    """Poses with their centres and headings, and roll, pitch and scale of those given."""
-    group = se3 if poses_cw.shape[-1] == 7 else sim3
-    turn = so3.multiply(so3.conjugate(given_cw[:, 3:7]), poses_cw[:, 3:7])  # of which the part about gravity is taken
-    about = _unit(torch.cat((gravity * (turn[:, :3] @ gravity)[:, None], turn[:, 3:]), -1))
-    q, scale = so3.multiply(given_cw[:, 3:7], about), given_cw[:, 7:]
-    t = -so3.rotate(q, group.inverse(poses_cw)[:, :3])
-    upright = torch.cat((t * scale if scale.shape[-1] else t, q, scale), -1)
-    same = (poses_cw == given_cw).all(-1, keepdim=True)  # poses that stay, to the last digit
-    return torch.where(same, given_cw, upright)
-
-
-def _unit(x: Tensor) -> Tensor:
-    return x / torch.linalg.vector_norm(x, dim=-1, keepdim=True)
 
 
 def _inverse_right_jacobian(xi: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from dvo.ba.pose_graph import (
 )
 from dvo.ba.sparse.levenberg import LMOptions
 from dvo.core.errors import DvoError
-from dvo.geometry import se3, sim3, so3
+from dvo.geometry import se3, sim3
 from eval.benchmarks.pose_graph import PoseGraph, make_laps, read_g2o
 
 GROUPS = {6: se3, 7: sim3}
@@ -329,125 +329,6 @@ def test_a_graph_in_the_plane_does_not_depend_on_information_outside_it(outside:
     assert not in_plane(world, measured, information)
     full = optimise_pose_graph(world, ii, jj, measured, information, with_solver("auto"))
     assert full.chi2 == pytest.approx(result.chi2, rel=1e-5)
-
-
-def upright_graph(dim: int, seed: int, angle: float = 0.3) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """:func:`random_graph` with a full information, and a direction of gravity of any length."""
-    poses, ii, jj, measured = random_graph(dim, seed, angle)
-    generator = torch.Generator().manual_seed(seed + 1)
-    root = torch.randn(6, dim, dim, dtype=torch.float64, generator=generator)
-    information = root.mT @ root + torch.eye(dim, dtype=torch.float64)
-    return poses, ii, jj, measured, information, 9.81 * torch.randn(3, dtype=torch.float64, generator=generator)
-
-
-def turned_and_shifted(poses: Tensor, change: Tensor, gravity: Tensor) -> Tensor:
-    """Poses whose cameras are turned about gravity by ``change[:, 3]`` where they are, and shifted in the world."""
-    group = GROUPS[poses.shape[-1] - 1]
-    turn = so3.exp(change[:, 3:] * gravity / gravity.norm())
-    inverse = group.inverse(poses)  # camera to world
-    moved = torch.cat((inverse[:, :3] + change[:, :3], so3.multiply(turn, inverse[:, 3:7]), inverse[:, 7:]), -1)
-    return group.inverse(moved)
-
-
-@pytest.mark.long
-@settings(max_examples=20, deadline=None)
-@given(st.sampled_from([6, 7]), st.sampled_from(["fronts", "tiles", "cg"]), st.integers(0, 10_000))
-def test_with_gravity_roll_pitch_and_scale_stay(dim: int, solver: str, seed: int):
-    poses, ii, jj, measured, information, gravity = upright_graph(dim, seed, 0.6)
-    result = optimise_pose_graph(poses, ii, jj, measured, information, with_solver(solver, gravity=gravity))
-    assert result.chi2 < result.initial_chi2 and torch.equal(result.poses_cw[0], poses[0])
-    assert torch.equal(result.poses_cw[:, 7:], poses[:, 7:])
-    down = [so3.rotate(x[:, 3:7], gravity / gravity.norm()) for x in (result.poses_cw, poses)]
-    torch.testing.assert_close(*down, rtol=0, atol=1e-13)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("solver", ["fronts", "tiles", "direct", "cg"])
-@pytest.mark.parametrize("dim", [6, 7])
-def test_with_gravity_the_minimum_is_that_of_scipy(dim: int, solver: str):
-    from scipy.optimize import least_squares
-
-    poses, ii, jj, measured, information, gravity = upright_graph(dim, 3)
-    whiten = torch.linalg.cholesky(information).mT
-
-    def residual(x: object) -> object:
-        moved = turned_and_shifted(poses[1:], torch.as_tensor(x).view(-1, 4), gravity)
-        e = residuals(torch.cat((poses[:1], moved)), ii, jj, measured)
-        return (whiten @ e[..., None]).flatten().numpy()
-
-    expected = least_squares(residual, torch.zeros(16).numpy(), xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    options = PoseGraphOptions(solver=LMOptions(200, tolerance=1e-14, solver=solver), gravity=gravity)  # type: ignore[arg-type]
-    result = optimise_pose_graph(poses, ii, jj, measured, information, options)
-    assert result.chi2 == pytest.approx(2 * expected.cost, rel=1e-8)
-    found = turned_and_shifted(poses[1:], torch.as_tensor(expected.x).view(-1, 4), gravity)
-    sign = (found[:, 3:7] * result.poses_cw[1:, 3:7]).sum(-1, keepdim=True).sign()
-    found[:, 3:7] *= sign
-    torch.testing.assert_close(result.poses_cw[1:], found, rtol=1e-5, atol=1e-5)
-
-
-def upright_loop(seed: int, tilt: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Three laps of a camera that looks about, of which steps are measured with noise of the heading and of the
-    position, and of ``tilt`` (rad) about the other axes: the poses given have the true roll and pitch.
-
-    Returns:
-        Poses, ii, jj, measurements, information, and the true poses, z up.
-    """
-    count, lap = 90, 30
-    generator = torch.Generator().manual_seed(seed)
-    angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / lap)
-    nod = 0.3 * torch.stack(((0.7 * angle).sin(), (1.3 * angle).cos(), torch.zeros_like(angle)), -1)
-    heading = torch.stack((torch.zeros_like(angle), torch.zeros_like(angle), angle), -1)
-    centre = torch.stack((4 * angle.cos(), 4 * angle.sin(), 0.5 * (0.5 * angle).sin()), -1)
-    true = se3.inverse(torch.cat((centre, so3.multiply(so3.exp(heading), so3.exp(nod))), -1))
-    ii = torch.cat((torch.arange(count - 1), torch.arange(count - lap)))
-    jj = torch.cat((torch.arange(1, count), torch.arange(lap, count)))
-    keep = torch.cat((torch.ones(count - 1, dtype=torch.bool), torch.arange(count - lap) % 5 == 4))
-    ii, jj = ii[keep], jj[keep]
-    loops = torch.arange(len(ii)) >= count - 1
-    sigma = torch.where(loops, 0.1, 1.0)[:, None]
-    down = so3.rotate(true[jj, 3:7], true.new_tensor([0.0, 0.0, 1.0]))
-    noise = torch.randn(len(ii), 7, dtype=torch.float64, generator=generator)
-    turn = 0.02 * noise[:, 3:4] * down + tilt * noise[:, 4:]
-    error = sigma * torch.cat((0.02 * noise[:, :3], turn), -1)
-    measured = se3.compose(se3.exp(error), se3.relative(true[ii], true[jj]))
-    chain = [true[0]]
-    for motion in measured[: count - 1]:
-        chain.append(se3.compose(motion, chain[-1]))
-    poses = torch.stack(chain)
-    # Roll and pitch as gravity tells them: the heading and the place of the chain.
-    turn = so3.multiply(so3.conjugate(true[:, 3:7]), poses[:, 3:7]) * true.new_tensor([0, 0, 1, 1])
-    q = so3.normalise(so3.multiply(true[:, 3:7], turn))
-    poses = torch.cat((-so3.rotate(q, se3.inverse(poses)[:, :3]), q), -1)
-    variance = torch.cat((torch.full((3,), 0.02**2), torch.full((3,), 0.02**2 + tilt**2))).double()
-    information = (1 / variance).expand(len(ii), 6) / sigma**2
-    return poses, ii, jj, measured, information, true
-
-
-def error_of(poses_cw: Tensor, true_cw: Tensor) -> float:
-    """Root mean square error of the centres."""
-    return float((centres_of(poses_cw) - centres_of(true_cw)).square().sum(-1).mean().sqrt())
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("tilt", "ratio"), [(0.0, 1.1), (0.02, 0.8)])
-def test_known_gravity_closes_loops_as_well_and_better_where_the_others_tilt(tilt: float, ratio: float):
-    found, free, before = [], [], []
-    for seed in range(6):
-        poses, ii, jj, measured, information, true = upright_loop(seed, tilt)
-        up = poses.new_tensor([0.0, 0.0, 1.0])
-        for errors, gravity in ((found, up), (free, None)):
-            options = with_solver("tiles", gravity=gravity)
-            errors.append(error_of(optimise_pose_graph(poses, ii, jj, measured, information, options).poses_cw, true))
-        before.append(error_of(poses, true))
-    assert sum(found) < ratio * sum(free) and sum(found) < 0.3 * sum(before)
-
-
-@pytest.mark.parametrize(
-    "gravity", [torch.zeros(3), torch.ones(2), torch.tensor([0.0, torch.nan, 1.0]), [0.0, 0.0, 1.0]]
-)
-def test_a_gravity_that_is_none_is_refused(gravity: Tensor):
-    with pytest.raises(DvoError, match="gravity"):
-        PoseGraphOptions(gravity=gravity)
 
 
 def write(path: Path, text: str) -> Path:

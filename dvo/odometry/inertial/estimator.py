@@ -585,7 +585,7 @@ class InertialEstimator:
     def _known_similarity(self, world: int) -> Similarity | None:
         """Present estimate of a world."""
         if self.solution is not None and world in self._known:
-            k = self._known.index(world)
+            k = len(self._known) - 1 - self._known[::-1].index(world)  # it may have come again
             w = self.solution.worlds
             return Similarity(float(np.exp(w.log_scale[k])), w.rotation[k], w.translation[k])
         return self.worlds.get(world)
@@ -597,9 +597,8 @@ class InertialEstimator:
         mine = np.flatnonzero(nodes.segment == segment)
         mine = mine[nodes.times[mine] > last.time] if (nodes.times[mine] > last.time).any() else mine
         state = self.predict(last, nodes.times[mine[:1]])[0] if nodes.times[mine[0]] > last.time else last
-        body = problem.rotation_camera_imu
-        rotation = state.rotation @ (nodes.rotation[mine[0]] @ body).T
-        rotation = rotation / np.cbrt(np.linalg.det(rotation))
+        # The axes of the segment are those of its first camera: until samples tell its vertical, the prediction does.
+        rotation = state.rotation @ (nodes.rotation[mine[0]] @ problem.rotation_camera_imu).T
         path, times = nodes.position[mine], nodes.times[mine]
         visual = (path[-1] - path[0]) if len(mine) > 1 else np.zeros(3)
         ahead = self.predict(state, times[-1:])[0] if len(mine) > 1 and times[-1] > state.time else state

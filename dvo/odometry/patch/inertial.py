@@ -197,7 +197,7 @@ class InertialTracking:
         for world, similarity in found.items():
             path = None
             if smoothed is not None and world in worlds:
-                path = _path(smoothed, nodes, nodes.segment == worlds.index(world))
+                path = _path(smoothed, nodes, np.array(worlds)[nodes.segment] == world)
             units |= self._follow(world, _Path.constant(similarity) if path is None else path)
         loops.moved(units)
         begun, entries = graph.recording.segment, []
@@ -275,8 +275,9 @@ class InertialTracking:
         if np.isneginf(since) and len(times):
             spacing = max(spacing, (times[-1] - times[0]) / MOST_NODES)
         chosen = _spaced(times, world_of, spacing)
-        worlds = list(dict.fromkeys(world_of[k] for k in chosen))
-        segment = np.array([worlds.index(world_of[k]) for k in chosen], int)
+        chosen_of = np.array([world_of[k] for k in chosen], int)
+        begins = np.diff(chosen_of, prepend=-1) != 0  # a world comes again where a segment was found in it
+        segment, worlds = np.cumsum(begins) - 1, chosen_of[begins].tolist()
         rotation, position = split(rows.poses_wc[chosen])
         depth = np.array([self._depth(world) for world in worlds])
         return VisualNodes(times[chosen], segment, rotation, position, depth), worlds

@@ -9,9 +9,9 @@ import pytest
 
 from dvo.data.inertial import InertialSamples
 from dvo.geometry.poses import rotation_vector, so3_exp
-from dvo.odometry.inertial.estimator import BodyState, InertialEstimator
+from dvo.odometry.inertial.estimator import BodyState, InertialEstimator, Similarity
 from dvo.odometry.inertial.options import InertialOptions
-from dvo.odometry.inertial.smoother import VisualNodes
+from dvo.odometry.inertial.smoother import GRAVITY, Similarities, VisualNodes, first_values, smooth, upright
 from dvo.odometry.inertial.stream import SampleStream
 from dvo.odometry.protocol import ScaleState
 from tests.support.visual_inertial import CAMERA_IMU, LEVER, SCALE, Recording, record
@@ -279,30 +279,68 @@ def _error(path: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sqrt(((a @ turn.T - b) ** 2).sum(1).mean()))
 
 
+def parts(recording: Recording, spans: list[tuple[float, float]], changes: list[Similarity]) -> VisualNodes:
+    """Nodes of some segments, each in a world and a unit of its own."""
+    nodes = [recording.nodes(*span) for span in spans]
+    return VisualNodes(
+        np.concatenate([part.times for part in nodes]),
+        np.concatenate([part.segment + k for k, part in enumerate(nodes)]),
+        np.concatenate([change.rotation @ part.rotation for part, change in zip(nodes, changes, strict=True)]),
+        np.concatenate([change.points(part.position) for part, change in zip(nodes, changes, strict=True)]),
+        np.array([change.scale * part.depth[0] for part, change in zip(nodes, changes, strict=True)]),
+    )
+
+
+SAME = Similarity(1.0, np.eye(3), np.zeros(3))
+OTHER = Similarity(2.5, so3_exp(np.array([0.4, -0.3, 0.8])), np.zeros(3))
+
+
 def test_a_new_segment_after_the_dark_is_joined_and_withdraws_nothing() -> None:
     recording = record(11, seconds=14.0)
     estimator, _ = drive(recording, until=7.0)
     assert estimator.aligned
-    turn, unit = so3_exp(np.array([0.4, -0.3, 0.8])), 2.5
     late = recording.times >= 9.0
     for time in recording.times[late & (recording.times < 13.0)]:
         estimator.add(recording.samples.between(estimator.stream.end, time))
-        if not estimator.due(time):
-            continue
-        old, new = recording.nodes(0.0, 7.0), recording.nodes(9.0, time)
-        both = VisualNodes(
-            np.concatenate([old.times, new.times]),
-            np.concatenate([old.segment, new.segment + 1]),
-            np.concatenate([old.rotation, turn @ new.rotation]),
-            np.concatenate([old.position, unit * new.position @ turn.T]),
-            np.array([old.depth[0], unit * old.depth[0]]),
-        )
-        estimator.update(both, [0, 4])
+        if estimator.due(time):
+            estimator.update(parts(recording, [(0.0, 7.0), (9.0, time)], [SAME, OTHER]), [0, 4])
     assert estimator.aligned and [entry["event"] for entry in estimator.history] == ["aligned"]
-    assert estimator.worlds[4].scale == pytest.approx(SCALE / unit, rel=0.05)
+    assert estimator.worlds[4].scale == pytest.approx(SCALE / OTHER.scale, rel=0.05)
     shown = recording.position[late][0]
-    first, second = estimator.worlds[0].points(shown), estimator.worlds[4].points(unit * turn @ shown)
+    first, second = estimator.worlds[0].points(shown), estimator.worlds[4].points(OTHER.points(shown))
     assert np.linalg.norm(first - second) < 0.3
+    # Position and heading are those of the prediction, and the vertical of the segment is its own.
+    turn = estimator.worlds[4].rotation @ OTHER.rotation @ estimator.worlds[0].rotation.T
+    assert np.linalg.norm(rotation_vector(turn)) < np.deg2rad(0.5)
+    assert (estimator.worlds[4].rotation @ OTHER.rotation @ recording.turn)[2, 2] > np.cos(np.deg2rad(0.3))
+
+
+def test_a_world_that_comes_again_has_the_similarity_of_its_newest_part() -> None:
+    recording = record(11, seconds=14.0)
+    estimator, _ = drive(recording, until=7.0)
+    estimator.add(recording.samples.between(estimator.stream.end, 13.0))
+    spans = [(0.0, 6.0), (6.5, 8.5), (9.0, 12.5)]
+    for end in (11.5, 12.5):
+        estimator.update(parts(recording, [*spans[:2], (9.0, end)], [SAME, OTHER, SAME]), [0, 4, 0])
+    assert estimator.aligned and set(estimator.worlds) == {0, 4}
+    assert estimator.worlds[4].scale == pytest.approx(SCALE / OTHER.scale, rel=0.05)
+    last = int(np.searchsorted(recording.times, 12.5 + 1e-6)) - 1
+    state = estimator.state_at(float(recording.times[last]))
+    assert state is not None
+    camera = state.position + state.rotation @ LEVER
+    assert np.linalg.norm(estimator.worlds[0].points(recording.position[last]) - camera) < 0.02
+
+
+def test_a_new_segment_finds_its_vertical_from_any_start() -> None:
+    """The prediction after the dark may be tilted; heading and position follow it, the vertical does not."""
+    recording = record(11, seconds=14.0)
+    problem = replace(recording.problem(0.1, 12.0), nodes=parts(recording, [(0.1, 6.0), (7.0, 12.0)], [SAME, OTHER]))
+    true = upright(recording.turn @ GRAVITY)
+    for tilt in (np.zeros(3), np.deg2rad([4.0, -3.0, 0.0])):
+        second = so3_exp(tilt) @ true @ OTHER.rotation.T
+        worlds = Similarities(np.log([SCALE, SCALE / OTHER.scale]), np.stack([true, second]), np.zeros((2, 3)))
+        found = smooth(problem, first_values(problem, worlds)).worlds
+        assert (found.rotation[1] @ OTHER.rotation @ recording.turn)[2, 2] > np.cos(np.deg2rad(0.3))
 
 
 def test_a_time_within_a_gap_of_the_samples_has_none_near_it():

@@ -198,6 +198,19 @@ def test_nodes_stand_on_either_side_of_a_break() -> None:
     assert _runs(np.array([False, True, True, False, True])) == [(1, 3), (4, 5)]
 
 
+def test_segments_of_a_world_that_comes_again_are_numbered_in_their_order() -> None:
+    """The third segment was found in the world of the first one; the smoother takes segments in the order of time."""
+    odometry = tracker()
+    for frame in with_samples(frames(14)):
+        odometry.track(frame)
+    for k, record in enumerate(odometry.graph.log.frames):
+        record.segment = min(k // 4, 2)
+    odometry.graph.worlds.update({1: 1, 2: 0})
+    nodes, worlds = odometry.inertial._nodes(-np.inf)
+    assert worlds == [0, 1, 0] and len(nodes.depth) == 3
+    assert (np.diff(nodes.segment) >= 0).all() and np.unique(nodes.segment).tolist() == [0, 1, 2]
+
+
 def test_what_is_missing_at_the_end_is_spread_over_the_time() -> None:
     poses = np.tile(IDENTITY, (3, 1))
     goal = np.concatenate([[0.3, 0.0, 0.0], [0.0, 0.0, np.sin(0.2), np.cos(0.2)]])

@@ -109,6 +109,11 @@ class Similarity:
         """``(..., 3)`` points in the units of the visual poses."""
         return (points - self.translation) @ self.rotation / self.scale
 
+    def before(self, change: Similarity) -> Similarity:
+        """The same place in the metric world, of poses that a similarity of the visual world has changed."""
+        scale, rotation = self.scale / change.scale, self.rotation @ change.rotation.T
+        return Similarity(scale, rotation, self.translation - scale * rotation @ change.translation)
+
 
 @dataclass(frozen=True)
 class BodyState:
@@ -265,6 +270,35 @@ class InertialEstimator:
             state = _step(state, time, offset, samples, self.noise)
             found.append(state)
         return found
+
+    def corrected(self, present: int, target: int, change: Similarity, time: float) -> None:
+        """Follow a correction of the visual poses by loops.
+
+        The newest poses keep their place in the metric world, at once and in the next estimates: their heading and
+        position are held where the last keyframe was corrected, not at the oldest node, whose way to them has changed.
+
+        Args:
+            present: number of the world that the newest visual poses were in.
+            target: of that they are in now.
+            change: from that world before to the one after.
+            time: of the last keyframe that was corrected, seconds.
+        """
+        known, s = self._known_similarity(present), self.solution
+        if known is None or s is None:
+            return
+        found = known.before(change)
+        self.worlds.pop(present, None)
+        self.worlds[target] = found
+        if present in self._known:
+            k = len(self._known) - 1 - self._known[::-1].index(present)
+            w = s.worlds
+            logs, rotations, translations = w.log_scale.copy(), w.rotation.copy(), w.translation.copy()
+            logs[k], rotations[k], translations[k] = np.log(found.scale), found.rotation, found.translation
+            # The estimate begins with the scales of the last one.
+            scales = s.log_scale - np.log(change.scale)
+            self.solution = replace(s, log_scale=scales, worlds=Similarities(logs, rotations, translations))
+            self._known[k] = target
+        self._held = time
 
     def last_state(self) -> BodyState | None:
         """State of the newest node of the solution; None without one."""

@@ -57,6 +57,7 @@ class LoopCloser:
         enabled: search for loops; otherwise nothing is kept or found.
         maintenance: of the map: the job in progress, and when its result is taken.
         adjuster: of global adjustments; None for no adjustments.
+        follow: is told of corrections that move the window.
 
     Attributes:
         loops: confirmed loops, in the order of their discovery.
@@ -71,6 +72,7 @@ class LoopCloser:
     enabled: bool = True
     maintenance: MapMaintenance = field(default_factory=MapMaintenance)
     adjuster: Adjuster | None = None
+    follow: loop_correction.Follow | None = None
     loops: list[Loop] = field(default_factory=list)
     corrections: int = 0
     wait: int = 0
@@ -330,7 +332,7 @@ class LoopCloser:
         later = self.graph.archive.kept_after(self.finder.kept[-1])
         kept = [*self.finder.kept, *(frame.identifier for frame in later)]
         self.corrections += 1
-        return loop_correction.apply(self.graph, kept, self.loops[-1], identifiers, found)
+        return loop_correction.apply(self.graph, kept, self.loops[-1], identifiers, found, self.follow)
 
     def moved(self, units: Moved) -> None:
         """Express the loops in new units of keyframes.

@@ -215,6 +215,22 @@ class InertialTracking:
         scale = {"source": "inertial", "unit": "metres", "segments": entries}
         return {"inertial": estimator.information(), **({"scale": scale} if entries else {})}
 
+    def corrected(self, present: int, change: Tensor, time: float) -> None:
+        """Follow a correction by loops, after which the present segment is in the world that it belongs to now.
+
+        Args:
+            present: number of the world that it was in.
+            change: ``(8,)`` similarity of the newest poses, from that world before to the one after.
+            time: of the last keyframe that was corrected, seconds.
+        """
+        rotation, translation = split(change[:7].numpy())
+        by = Similarity(float(change[7]), rotation, translation)
+        self._last, self._before = (
+            None if known is None else (known[0], _changed(known[1], by)) for known in (self._last, self._before)
+        )
+        if not self.metric and self.estimator.aligned:
+            self.estimator.corrected(present, self.graph.world_of(self.graph.segment), by, time)
+
     def _follow(self, world: int, path: _Path) -> dict[int, float]:
         """Move the kept keyframes of a world; the scale of the similarity of each."""
         graph = self.graph
@@ -485,9 +501,13 @@ def _led(
     return led
 
 
+def _changed(poses_wc: np.ndarray, similarity: Similarity) -> np.ndarray:
+    rotation, position = split(poses_wc)
+    return pose_from(similarity.rotation @ rotation, similarity.points(position))
+
+
 def _moved(trajectory: Trajectory, similarity: Similarity) -> Trajectory:
-    rotation, position = split(trajectory.poses_wc)
-    return Trajectory(trajectory.timestamps, pose_from(similarity.rotation @ rotation, similarity.points(position)))
+    return Trajectory(trajectory.timestamps, _changed(trajectory.poses_wc, similarity))
 
 
 def _moved_segment(segment: Segment, similarity: Similarity) -> Segment:

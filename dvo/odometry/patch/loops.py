@@ -8,6 +8,7 @@ from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.places import PlaceIndex
 from dvo.models.patch_vo import PatchVO
 from dvo.odometry.loops.closure import LoopCloser
+from dvo.odometry.loops.correction import Follow
 from dvo.odometry.loops.finder import LoopFinder
 from dvo.odometry.loops.joint_window import GroupMatcher
 from dvo.odometry.loops.place_descriptors import PLACE_DESCRIPTORS, PlaceDescriptor
@@ -18,8 +19,9 @@ from dvo.odometry.patch.state import TrackerState
 
 
 def loop_closer(
-    model: PatchVO, config: TrackerConfig, graph: KeyframeGraph, device: torch.device, state: TrackerState
-) -> LoopCloser:
+    model: PatchVO, config: TrackerConfig, graph: KeyframeGraph, device: torch.device, state: TrackerState,
+    follow: Follow,
+) -> LoopCloser:  # fmt: skip
     """Loop closure of a tracker.
 
     Args:
@@ -28,6 +30,7 @@ def loop_closer(
         graph: of the tracker.
         device: of the computation.
         state: of the tracker.
+        follow: is told of corrections that move the window.
     """
     build = PLACE_DESCRIPTORS.resolve(config.loop.descriptor)
     described: PlaceDescriptor | None = build(model.config.feature_channels)
@@ -35,4 +38,4 @@ def loop_closer(
     finder = LoopFinder(graph, GroupMatcher(model, config.measuring, device), places, described, config.loop)
     adjuster = Adjuster(graph, lambda: state.shutter, config.adjustment, config.adjust_after_loop)
     maintenance = MapMaintenance(config.real_time, config.loop.steps)
-    return LoopCloser(graph, finder, config.loops, maintenance, adjuster)
+    return LoopCloser(graph, finder, config.loops, maintenance, adjuster, follow)

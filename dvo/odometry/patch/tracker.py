@@ -126,7 +126,7 @@ class PatchOdometry:
         self.aligner: FrameAlignment | None = None
         if config.aligned_motion > 0 and not self.sensors:
             self.aligner = FrameAlignment(self.patch_window, config.alignment, config.motion_damping)
-        self.loops = loop_closer(self.model, config, self.graph, self.device, self.state)
+        self.loops = loop_closer(self.model, config, self.graph, self.device, self.state, self.inertial.corrected)
 
     @property
     def window(self) -> Window:

@@ -331,6 +331,31 @@ def test_a_world_that_comes_again_has_the_similarity_of_its_newest_part() -> Non
     assert np.linalg.norm(estimator.worlds[0].points(recording.position[last]) - camera) < 0.02
 
 
+def test_the_newest_poses_keep_their_place_after_a_loop_and_in_the_estimates_that_follow() -> None:
+    """A loop moves keyframes the further the later they are, into another unit; the oldest node stays where it was."""
+    recording, end = record(21, seconds=14.0), 10.5
+    plain, moved = (drive(recording, until=11.0)[0] for _ in range(2))
+    change = Similarity(1.3, so3_exp(np.array([0.02, -0.01, 0.03])), np.array([0.6, -0.4, 0.2]))
+    moved.corrected(0, 0, change, end)
+    shares = np.clip((recording.times - 2.0) / (end - 2.0), 0, 1)
+    rotation = np.stack([so3_exp(share * rotation_vector(change.rotation)) for share in shares])
+    places = change.scale * (rotation @ recording.position[..., None])[..., 0] + shares[:, None] * change.translation
+    after = replace(recording, rotation=rotation @ recording.rotation, position=places)
+    for until in (11.0, 13.5):
+        for estimator, shown in ((plain, recording), (moved, after)):
+            for time in shown.times[(shown.times > estimator.stream.end) & (shown.times <= until)]:
+                estimator.add(shown.samples.between(estimator.stream.end, time))
+                if estimator.due(time):
+                    estimator.update(shown.nodes(time - 20.0, time), [0])
+        last = int(np.searchsorted(recording.times, until + 1e-6)) - 1
+        expected, found = (e.worlds[0].points(r.position[last]) for e, r in ((plain, recording), (moved, after)))
+        assert np.linalg.norm(found - expected) < (1e-9 if until == 11.0 else 0.05)
+        turn = moved.worlds[0].rotation @ after.rotation[last] @ (plain.worlds[0].rotation @ recording.rotation[last]).T
+        assert np.linalg.norm(rotation_vector(turn)) < (1e-9 if until == 11.0 else 0.01)
+    assert moved.worlds[0].scale * change.scale == pytest.approx(plain.worlds[0].scale, rel=0.02)
+    assert [entry["event"] for entry in moved.history] == ["aligned"]
+
+
 def test_a_new_segment_finds_its_vertical_from_any_start() -> None:
     """The prediction after the dark may be tilted; heading and position follow it, the vertical does not."""
     recording = record(11, seconds=14.0)

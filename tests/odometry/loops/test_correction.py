@@ -55,3 +55,18 @@ def test_keyframes_that_were_archived_meanwhile_move_with_the_last_before_them(w
         expected = found[row] if row <= last else sim3.compose(step, found[last])
         assert torch.equal(after[row], torch.cat([expected[:3] / expected[7:], expected[3:7]]))
         assert units[k] == float(expected[7])
+
+
+def test_a_correction_of_the_window_is_told(walk):
+    graph, kept = walk
+    loop, told = loop_of(graph, kept, 0, 7), []
+    last = np.array(kept[-1:])
+    before = sim3.from_se3(graph.poses_cw(last))
+    correction.apply(graph, kept, loop, *correction.solve(graph, kept, [loop], loop), lambda *what: told.append(what))
+    ((present, change, time),) = told
+    assert present == graph.world_of(graph.segment) and time == graph.archive[kept[-1]].timestamp
+    moved = sim3.compose(before, sim3.inverse(change[None]))
+    expected = graph.poses_cw(last)
+    assert float(change[7]) != 1
+    torch.testing.assert_close(moved[:, :3] / moved[:, 7:], expected[:, :3], rtol=0, atol=1e-6)
+    torch.testing.assert_close(moved[:, 3:7], expected[:, 3:7], rtol=0, atol=1e-6)

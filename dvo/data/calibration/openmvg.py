@@ -74,8 +74,8 @@ def _calibration(data: dict[str, Any], kind: str, path: Path) -> Calibration:
     key, order = _LENSES[kind]
 
     def numbers(name: str, count: int) -> list[float]:
-        value = values.get(name)
-        listed = value if isinstance(value, list) else [value]
+        value: Any = values.get(name)
+        listed: list[Any] = value if isinstance(value, list) else [value]
         try:
             found = [float(part) for part in listed]
         except (TypeError, ValueError, OverflowError):

@@ -185,15 +185,17 @@ def correcting(film):
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_saving_leaves_work_in_progress_alone(film, closed, tmp_path):
+def test_saving_leaves_work_in_progress_alone(tmp_path):
     """Maps are those before the result of a search, or a correction, is there."""
+    frames, _ = there_and_back(36)  # so long that a correction is applied before the end
+    closed = track(frames)
     states = {
         "searching": lambda loops: kind(loops) == "search" and loops.pending is not None,
         "correcting": lambda loops: kind(loops) == "correction",
         "closed": lambda loops: loops.corrections > 0 and loops.maintenance.job is None,
     }
     odometry, saved = dvo.load("small", device="cpu", loop=OPTIONS, **SHORT), {}
-    for frame in film[0]:
+    for frame in frames:
         odometry.track(frame)
         for name in [name for name, state in states.items() if name not in saved and state(odometry.loops)]:
             saved[name] = [loop.measurement for loop in odometry.loops.loops]

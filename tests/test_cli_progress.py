@@ -39,6 +39,9 @@ def test_phases_and_totals():
     progress.begin_round(2, 5, 60)
     progress.update(FRAME, None)
     assert progress.line.startswith("calibrating, round 2 of at most 5, 1 of 60 frames, ")
+    for _ in range(60):
+        progress.update(FRAME, None)
+    assert progress.line.startswith("calibrating, round 2 of at most 5, 61 frames, ") and "left" not in progress.line
     progress.name("adjusting")
     assert progress.line == "adjusting, 0 s so far"
 

@@ -245,7 +245,11 @@ class TrackingProgress:
         self._moments.clear()
         self._moments.append(self._began)
         with contextlib.suppress(OSError):
-            self._progress.reset(self._task, total=total, description=phase, rate=0.0, status="")
+            self._progress.reset(self._task, description=phase, rate=0.0, status="")
+        self._show_total()
+
+    def _show_total(self) -> None:
+        self._progress.tasks[0].total = self._total  # reset() and update() would leave the one before in place of none
 
     def name(self, phase: str) -> None:
         """Name what is done after the last frame; the counts stay.
@@ -293,6 +297,9 @@ class TrackingProgress:
         rate = (len(self._moments) - 1) / max(self._moments[-1] - self._moments[0], 1e-9)
         self._done, self._rate = self._done + 1, rate
         fields: dict[str, Any] = {"rate": rate}
+        if self._total is not None and self._done > self._total:  # a round goes on for frames without a pose
+            self._total = None
+            self._show_total()
         if estimate is not None:
             fields["status"] = f"[{_COLOURS[estimate.status]}]{describe_status(estimate)}"
         with contextlib.suppress(OSError):

@@ -74,7 +74,7 @@ class Quality:
         >>> result = dvo.run(dvo.load("small"), dvo.open("video.mp4", calib="calib.txt")).result
         >>> if result.quality.verdict != "good":
         ...     print(result.quality)
-        doubtful: corners that were followed do not agree with the poses (41% of them do)
+        doubtful: corners that were followed do not agree with the poses (off by 16% of their motion)
     """
 
     verdict: Verdict
@@ -143,8 +143,8 @@ def judge(quality: Quality, frames: int, cause: str = "") -> tuple[Verdict, str,
         return "doubtful", "the picture is shifted from image to image, as in stabilised video", STEADY
     doubts = [lack if math.isfinite(lack) else 0.0 for lack in lacks(quality)]
     if sum(doubts) > 1 and doubts[0] > doubts[1]:
-        reason = f"corners that were followed do not agree with the poses ({quality.check:.0%} of them do)"
-        return "doubtful", reason, MASK
+        off = f"off by {quality.deviation:.0%} of their motion"
+        return "doubtful", f"corners that were followed do not agree with the poses ({off})", MASK
     if sum(doubts) > 1 or not math.isfinite(quality.agreement):
         share = f"{quality.agreement:.1%} of them agree" if math.isfinite(quality.agreement) else "there are none"
         return "doubtful", f"the measurements contradict each other ({share})", CALIBRATE

@@ -102,7 +102,7 @@ def test_the_share_of_the_frames_through_which_corners_hardly_move(film):
     [
         ({}, "good", ""),
         ({"deviation": MOST_DEVIATION + 0.01}, "doubtful", "do not agree with the poses"),
-        ({"deviation": 0.06, "check": 0.6, "agreement": 0.95}, "doubtful", "(60% of them do)"),
+        ({"deviation": 0.06, "check": 0.6, "agreement": 0.95}, "doubtful", "(off by 6% of their motion)"),
         ({"deviation": 0.03, "agreement": 0.89}, "doubtful", "contradict each other"),
         ({"deviation": 0.03, "check": 0.6, "agreement": 0.92}, "good", ""),
         ({"deviation": float("nan"), "checks": 0}, "doubtful", "too little of the picture moves"),

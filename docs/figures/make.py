@@ -112,11 +112,11 @@ def draw_correlation(odometry: PatchOdometry) -> Any:
     """
     from matplotlib.patches import Rectangle
 
-    window, pair, step = odometry.window, newest_pair(odometry), odometry.step
+    window, pair = odometry.window, newest_pair(odometry)
     before, into = window.snapshot(), window.jj == len(window) - 1
     window.poses_cw = torch.cat([window.poses_cw[:-1], window.poses_cw[-2:-1]])
     window.hidden = torch.where(into[:, None], 0.0, window.hidden)
-    revision = step.revise()
+    revision = odometry.patch_window.revise()
     window.restore(before)
     moved = revision.delta[0, pair.edges].norm(dim=1)
     size = torch.tensor(pair.images[1].shape[1::-1]) / pair.stride
@@ -177,7 +177,7 @@ def draw_equations(odometry: PatchOdometry) -> Any:
     )
     found = window_equations(
         poses, patches[..., :2], patches[..., 2], intrinsics, targets, weights, window.jj, window.kk - source * m,
-        source, BAOptions(bounds=odometry.step.bounds, kernel=odometry.config.kernel),
+        source, BAOptions(bounds=odometry.patch_window.bounds, kernel=odometry.config.kernel),
     )  # fmt: skip
     b, e, c = found.h_pp[0], found.h_pl[0], found.h_ll[0]
     inverse = invert_blocks(c[None, :, None, None])[0, :, 0, 0]

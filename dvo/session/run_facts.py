@@ -78,7 +78,7 @@ _FOCAL = {"focal": _NUMBER, "deviation": _NUMBER, "source": _TEXT}
 _METRIC_SEGMENT = _table({"segment": _COUNT, "source": _TEXT}, ("segment", "source"))
 _INFO = {
     "loops": _listed(_table(_LOOP, ("from", "to"))),
-    "scale": _table({"segments": _listed(_METRIC_SEGMENT)}),
+    "scale": _table({"segments": _listed(_METRIC_SEGMENT)}, ("segments",)),
 }
 _RUN = _table(
     {

@@ -7,6 +7,7 @@ principal point is counted from the middle of the image (https://github.com/alic
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -108,9 +109,12 @@ def _calibration(values: dict[str, Any], version: tuple[int, ...], path: Path) -
 
 def _number(value: Any, name: str, path: Path) -> float:
     try:
-        return float(value)
+        number = float(value)
     except (TypeError, ValueError, OverflowError):
-        raise DvoError(f"no number: {str(value)[:40]!r}", file=path, field=name, remedy=_REMEDY) from None
+        number = math.nan
+    if not math.isfinite(number):
+        raise DvoError(f"no number: {str(value)[:40]!r}", file=path, field=name, remedy=_REMEDY)
+    return number
 
 
 DIALECT = Dialect(is_meshroom, meshroom_calibration)

@@ -70,7 +70,7 @@ def rows_without_times(file: Path) -> int | None:
         DvoError: the file cannot be read.
     """
     lengths = [len(fields) for _, fields in read_rows(file, "give an existing file", "groundtruth")]
-    return len(lengths) if lengths and lengths[0] in _WITHOUT_TIMES else None
+    return len(lengths) if lengths and lengths[0] in _WITHOUT_TIMES and not _has_header(file) else None
 
 
 def _on_clock(found: Trajectory, timestamps: np.ndarray | None) -> Trajectory:

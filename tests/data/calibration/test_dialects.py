@@ -743,6 +743,8 @@ REFUSED = [
     ("cameras.sfm", meshroom("1.2.6", "equidistant", [], LATER | {"distortionType": "radialk3"}), "'equidistant'"),
     ("cameras.sfm", meshroom("1.2.6", "radial1", KC, LATER), "distortionParams: 4 coefficients of radial1"),
     ("cameras.sfm", meshroom("1.0", "pinhole", []), "version: no version of three numbers"),
+    ("cameras.sfm", meshroom("1e999.0.0", "pinhole", []), "version: no number: '1e999'"),
+    ("cameras.sfm", meshroom("1.nan.0", "pinhole", []), "version: no number: 'nan'"),
     ("cameras.sfm", meshroom("1.0.0", "pinhole", [], {"pxFocalLength": "x"}), "pxFocalLength: no number: 'x'"),
     ("cameras.sfm", meshroom("1.2.6", "pinhole", [], LATER | {"sensorWidth": "0"}), "sensorWidth, pixelRatio"),
     ("cameras.sfm", meshroom("1.0.0", "pinhole", [], intrinsics={}), "intrinsics: no list of cameras"),

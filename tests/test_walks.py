@@ -132,13 +132,16 @@ def test_owner_of_a_real_phone(shell, desk):
 
 @pytest.mark.slow
 def test_a_phone_that_comes_back_to_its_start(shell, desk):
-    """The whole clip, without a calibration and without loops: from the last pose to the first is 1.5 % of the path."""
-    said = shell.type(f"dvo run '{desk}' --fps 9.4 --no-loops --out desk")
-    assert FOCAL.search(said.out) and len(summary(shell.folder / "desk")["segments"]) == 1
-    positions = read_tum(shell.folder / "desk" / "trajectory.txt").positions
-    assert len(positions) == 198
-    path = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
-    assert np.linalg.norm(positions[-1] - positions[0]) < 0.015 * path
+    """The whole clip, without a calibration and without loops: from the last pose to the first, of the path."""
+    shares = []
+    for seed in range(3):
+        said = shell.type(f"dvo run '{desk}' --fps 9.4 --no-loops --seed {seed} --out desk{seed}")
+        assert FOCAL.search(said.out) and len(summary(shell.folder / f"desk{seed}")["segments"]) == 1
+        positions = read_tum(shell.folder / f"desk{seed}" / "trajectory.txt").positions
+        assert len(positions) == 198
+        path = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
+        shares.append(np.linalg.norm(positions[-1] - positions[0]) / path)
+    assert np.median(shares) < 0.015
 
 
 # --- roboticist ------------------------------------------------------------------------------------------------------

@@ -15,9 +15,11 @@ from dvo.core import ahead
 F = TypeVar("F", bound=Callable[..., Any])
 
 # The order of sums may be changed when a kernel is compiled, so that they use vector instructions; it is then fixed.
-# Infinite numbers and NaN keep their meaning. Nothing in C calls a kernel.
+# Infinite numbers and NaN keep their meaning. Nothing in C calls a kernel. A function becomes a piece of each that
+# calls it: one that is called instead has a copy in each of them, and where several are in memory the first copy serves
+# all, so that the sums of a kernel would depend on which others are there.
 _OPTIONS: dict[str, Any] = dict(
-    nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, no_cfunc_wrapper=True
+    nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, no_cfunc_wrapper=True, forceinline=True
 )
 
 
@@ -110,14 +112,11 @@ def _tried(step: Callable[..., Any]) -> Callable[..., Any]:
 def part(function: F) -> F:
     """Compile a function that only compiled ones of its file call; it costs half the time, and no file of its own.
 
-    It becomes a piece of each that calls it. One that is called instead has a copy in each of them, and where several
-    are in memory the first copy serves all: then the sums of a kernel would depend on which others are there.
-
     Args:
         function: see :func:`compiled`.
 
     Returns:
         The same, compiled.
     """
-    options: dict[str, Any] = dict(_OPTIONS, no_cpython_wrapper=True, forceinline=True)
+    options: dict[str, Any] = dict(_OPTIONS, no_cpython_wrapper=True)
     return numba.njit(**options)(function)

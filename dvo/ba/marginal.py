@@ -18,9 +18,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from dvo.ba.blocks import State, StateBlock
 from dvo.ba.layer.linearisation import landmark_count, landmark_part, reduced_part
 from dvo.ba.problem import Factor, Linearisation, Problem
-from dvo.ba.state import State, StateBlock
 from dvo.core.errors import DvoError
 
 Difference = Callable[[Tensor, Tensor], Tensor]
@@ -36,7 +36,7 @@ class LinearPrior(Factor):
         first: ``(B, V)`` first estimates of the elements one after the other, flattened.
         elements: ``(S,)`` element of each slot.
         blocks: ``S`` names of state blocks.
-        differences: ``S`` functions, see :attr:`dvo.ba.state.StateBlock.difference`.
+        differences: ``S`` functions, see :attr:`dvo.ba.blocks.StateBlock.difference`.
         dims: ``S`` sizes of the tangents.
     """
 
@@ -153,7 +153,7 @@ def marginalise(
         problem; see :meth:`LinearPrior.renumbered`.
 
     Raises:
-        DvoError: an element whose block has no :attr:`dvo.ba.state.StateBlock.difference`, or of which another element
+        DvoError: an element whose block has no :attr:`dvo.ba.blocks.StateBlock.difference`, or of which another element
             moves by the same unknown.
     """
     if form not in ("root", "schur"):

@@ -9,13 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES
+from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES, StateBlock
 from dvo.ba.edges import EdgePlan, plan_edges
 from dvo.ba.kernels import Kernel
 from dvo.ba.layer.reprojection import PatchReprojection
 from dvo.ba.options import Sensors
 from dvo.ba.problem import Factor
-from dvo.ba.state import StateBlock
 from dvo.core.errors import DvoError
 
 KERNEL = Kernel("cauchy", 0.1)

@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dvo.ba.blocks import State, StateBlock
 from dvo.ba.layer.linearisation import AdjointConstants, Linearisation, NormalEquations, adjoint_term, assemble
-from dvo.ba.state import State, StateBlock
 from dvo.core.errors import DvoError
 
 __all__ = [

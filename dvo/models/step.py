@@ -14,12 +14,12 @@ from typing import Literal, Protocol
 
 from torch import Tensor
 
+from dvo.ba.blocks import StateBlock
 from dvo.ba.kernels import Kernel
 from dvo.ba.options import BADamping, BAOptions
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor
 from dvo.ba.solve import solve
-from dvo.ba.state import StateBlock
 from dvo.geometry.projection import reproject
 from dvo.map.edges import PatchGraph
 from dvo.nets.correlation.correlation import CorrelationLookup

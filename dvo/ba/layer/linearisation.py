@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from dvo.ba.state import State
+from dvo.ba.blocks import State
 from dvo.core.errors import DvoError
 
 

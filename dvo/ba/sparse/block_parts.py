@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from dvo.ba.blocks import State
 from dvo.ba.layer.linearisation import Linearisation
-from dvo.ba.state import State
 
 PART = 6
 """Numbers of a part: those of a pose."""

@@ -20,11 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.blocks import IMU_BIAS, VELOCITY, inertial_blocks
+from dvo.ba.blocks import IMU_BIAS, VELOCITY, StateBlock, inertial_blocks
 from dvo.ba.factors import VectorPrior
 from dvo.ba.kernels import Kernel
 from dvo.ba.problem import Factor
-from dvo.ba.state import StateBlock
 from dvo.data.frame import Frame
 from dvo.geometry import se3
 from dvo.geometry.poses import pose_from, skew

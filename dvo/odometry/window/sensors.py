@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
+from dvo.ba.blocks import StateBlock
 from dvo.ba.problem import Factor
-from dvo.ba.state import StateBlock
 from dvo.core.registry import Registry
 from dvo.data.frame import Frame
 from dvo.map.window import Window

@@ -176,7 +176,7 @@ def demo(arguments: argparse.Namespace) -> int:
         # Imported here, since the process is to start before torch is imported.
         from dvo.commands.console import say, seed_everything
         from dvo.commands.run import device_for, load_odometry, track
-        from dvo.core.threads import core_left
+        from dvo.core.context import core_left
         from dvo.session.results import results_folder
 
         device = device_for(arguments)

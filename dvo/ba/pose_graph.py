@@ -29,9 +29,8 @@ from dvo.ba.sparse.equations import SparseSystem
 from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
 from dvo.ba.sparse.multifrontal import scipy_is_installed
 from dvo.ba.sparse.schur_pattern import make_schur_pattern
-from dvo.core.context import full_precision
+from dvo.core.context import full_precision, use_threads
 from dvo.core.errors import DvoError
-from dvo.core.threads import use_threads
 from dvo.geometry import se3, sim3, so3
 
 Chart = Literal["log", "split", "quaternion"]

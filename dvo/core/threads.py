@@ -13,11 +13,8 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-
-from dvo.core.errors import DvoError
 
 WAIT_POLICY = "OMP_WAIT_POLICY"
 NUMBERS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -143,67 +140,6 @@ def settle_threads() -> Threads:
     return current_threads()
 
 
-def use_threads() -> None:
-    """Note that torch computes, by several threads if it has several; what takes long or many tensors calls it first.
-
-    A forked process has only the thread that forked. Torch would hand parts of its work to the others of its parent,
-    and wait for them for ever; with one thread of its own it hands over nothing.
-
-    Raises:
-        DvoError: a process with several threads that was forked after those of its parent had computed.
-    """
-    import torch
-
-    if torch.get_num_threads() == 1:
-        return
-    if _forks["after work"]:
-        raise DvoError(
-            "this process was forked after threads of torch had computed in its parent, and would wait for them",
-            field="fork",
-            remedy='start it by multiprocessing.get_context("spawn") or get_context("forkserver"), or call '
-            "torch.set_num_threads(1) in it first",
-        )
-    _forks["work"] = True
-
-
-def _after_fork() -> None:
-    _forks["after work"] = _forks["work"]
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
-
-
-@contextmanager
-def core_left(busy: bool = True) -> Iterator[None]:
-    """Leave a core to a busy thread of this process: torch computes with one thread less, if all cores have one.
-
-    With more threads than cores those that share a core wait for each other in every parallel loop. On two cores beside
-    a busy thread, tracking is faster with one thread than with two.
-
-    Args:
-        busy: there is such a thread; nothing changes otherwise.
-    """
-    import torch
-
-    count = torch.get_num_threads()
-    fewer = min(count, max(1, available_cores() - 1)) if busy else count
-    if fewer != count:
-        torch.set_num_threads(fewer)
-    try:
-        yield
-    finally:
-        if fewer != count:
-            torch.set_num_threads(count)
-
-
-def core_free() -> bool:
-    """Tell if a thread beside those of torch would have a core of its own."""
-    import torch
-
-    return torch.get_num_threads() < available_cores()
-
-
 def current_threads() -> Threads:
     """Threads of this process as they are now.
 
@@ -252,7 +188,6 @@ def default_counts() -> set[int]:
 
 
 _state: dict[str, str] = {}  # origins of the choices made in this process
-_forks = {"work": False, "after work": False}  # several threads have computed; this process was forked after that
 
 
 def processor_quota(membership: Path, root: Path) -> float:

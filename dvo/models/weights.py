@@ -15,10 +15,10 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from dvo.core.arguments import checked_arguments
+from dvo.core.context import use_threads
 from dvo.core.errors import DvoError
 from dvo.core.limits import limit_error
 from dvo.core.text import choice
-from dvo.core.threads import use_threads
 from dvo.data.files.output import replaced
 from dvo.models.pickles import check_plain, load_pickle
 from dvo.models.published import read_published
@@ -233,7 +233,7 @@ def load_weights(name_or_file: str | Path, device: torch.device | str = "cpu") -
     Raises:
         DvoError: no such file; not safetensors (a pickle is never opened here); an architecture that is not
             registered; tensors that are missing, of the wrong shape, or not finite; a forked process, see
-            :func:`dvo.core.threads.use_threads`.
+            :func:`dvo.core.context.use_threads`.
     """
     use_threads()
     path = find_weights(name_or_file)

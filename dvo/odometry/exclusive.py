@@ -8,9 +8,8 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any, NoReturn, TypeVar
 
-from dvo.core.context import in_own_context, own_context
+from dvo.core.context import in_own_context, own_context, use_threads
 from dvo.core.errors import DvoError
-from dvo.core.threads import use_threads
 
 T = TypeVar("T")
 
@@ -26,7 +25,7 @@ def exclusive(cls: type[T]) -> type[T]:
     A method of :data:`METHODS` that is called while another thread is in one of them, of the same object, begins when
     that one has ended: ``current`` and ``save`` see the state between two frames. Attributes are not protected. The
     lock is an attribute of the object, which its constructor makes first. In a forked process that cannot compute
-    (:func:`dvo.core.threads.use_threads`), or that was forked while another thread was in a method, all of them raise a
+    (:func:`dvo.core.context.use_threads`), or that was forked while another thread was in a method, all of them raise a
     :class:`DvoError`. They compute in :func:`dvo.core.context.own_context`.
 
     Args:

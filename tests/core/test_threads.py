@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import dvo
-from dvo.core import threads
+from dvo.core import context, threads
 from dvo.core.errors import DvoError
 from dvo.core.threads import available_cores, process_environment, processor_quota, thread_rule
 from dvo.synth.clip import make_clip
@@ -84,11 +84,11 @@ LOAD = "import os, dvo; dvo.load(); import torch; from dvo.core.threads import c
     (2, 2, True, 1), (2, 2, False, 2), (8, 4, True, 4), (4, 4, True, 3), (1, 1, True, 1), (2, 1, True, 1),
 ])  # fmt: skip
 def test_a_core_is_left_to_a_busy_thread(monkeypatch, cores, count, busy, expected):
-    monkeypatch.setattr(threads, "available_cores", lambda: cores)
+    monkeypatch.setattr(context, "available_cores", lambda: cores)
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
-        with pytest.raises(ValueError), threads.core_left(busy):
+        with pytest.raises(ValueError), context.core_left(busy):
             assert torch.get_num_threads() == expected
             raise ValueError
         assert torch.get_num_threads() == count
@@ -253,16 +253,16 @@ def test_a_fork_before_work_of_several_threads_computes():
 def test_work_of_several_threads_is_noted_at_its_entries(monkeypatch):
     """As :data:`FORK` does in processes of their own; a fork is only told here."""
     forks = {"work": False, "after work": False}
-    monkeypatch.setattr(threads, "_forks", forks)
+    monkeypatch.setattr(context, "_forks", forks)
     torch.set_num_threads(1)
     dvo.load_model("small")
-    threads._after_fork()
+    context._after_fork()
     assert not any(forks.values()), "one thread"
     try:
         torch.set_num_threads(2)
-        threads.use_threads()
+        context.use_threads()
         assert forks["work"] and not forks["after work"]
-        threads._after_fork()
+        context._after_fork()
         for work in (lambda: dvo.load("small"), lambda: dvo.load_model("small"), lambda: make_clip(0, 0)):
             with pytest.raises(DvoError, match="fork: .*forked after threads of torch.*spawn"):
                 work()

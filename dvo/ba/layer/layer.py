@@ -30,11 +30,10 @@ from dvo.ba.layer.transforms import composed
 from dvo.ba.options import BADamping, BAOptions, BAResult, Sensors
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, Problem, State, StateBlock
-from dvo.core.context import full_precision
+from dvo.core.context import full_precision, use_threads
 from dvo.core.errors import DvoError
 from dvo.core.kernels import is_transformed, use_device_kernels, use_kernels
 from dvo.core.settings import shown
-from dvo.core.threads import use_threads
 from dvo.geometry import se3
 
 __all__ = ["BADamping", "BAOptions", "BAResult", "Sensors", "bundle_adjust", "make_problem"]

@@ -25,9 +25,8 @@ from dvo.ba.sparse.equations import SparseSystem
 from dvo.ba.sparse.global_edges import ReprojectionEdges
 from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
 from dvo.ba.sparse.schur_pattern import SchurPattern, make_schur_pattern
-from dvo.core.context import full_precision
+from dvo.core.context import full_precision, use_threads
 from dvo.core.errors import DvoError
-from dvo.core.threads import use_threads
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
-from dvo.core.threads import core_free
+from dvo.core.context import core_free
 from dvo.odometry.maintenance.background import Background, Steps, StepsAhead, Task, all_steps
 
 T = TypeVar("T")

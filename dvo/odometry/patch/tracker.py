@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from dvo.core.arguments import checked_arguments
+from dvo.core.context import core_left
 from dvo.core.errors import DvoError
-from dvo.core.threads import core_left
 from dvo.data.frame import Frame
 from dvo.data.inertial import InertialSamples
 from dvo.geometry import se3

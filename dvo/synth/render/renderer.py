@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.core.context import use_threads
 from dvo.core.errors import DvoError
-from dvo.core.threads import use_threads
 from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.render.antialias import smooth_outlines
 from dvo.synth.render.meshes import mesh_depth, render_mesh, trace_mesh

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from dvo.core.context import use_threads
 from dvo.core.errors import DvoError
 from dvo.core.registry import Registry
-from dvo.core.threads import use_threads
 from dvo.synth import salts
 from dvo.synth.scenes.scene import Scene
 from dvo.synth.textures.texture import TexturePool, texture_pool

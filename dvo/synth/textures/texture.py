@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from dvo.core.threads import use_threads
+from dvo.core.context import use_threads
 from dvo.synth import salts
 from dvo.synth.textures.patterns import PATTERNS, SPECIAL, Rng
 from dvo.synth.textures.photographs import folder_photographs, photographs

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from dvo.ba.blocks import StateBlock
 from dvo.ba.kernels import Kernel
+from dvo.ba.layer.layer import adjust_dense, dense_solution
 from dvo.ba.options import BADamping, BAOptions
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor
-from dvo.ba.solve import solve
 from dvo.geometry.projection import reproject
 from dvo.map.edges import PatchGraph
 from dvo.nets.correlation.correlation import CorrelationLookup
@@ -88,7 +88,6 @@ class StepOptions:
         iterations: Gauss-Newton iterations.
         damping: of bundle adjustment.
         bounds: ``(width, height)`` of the feature map, see :func:`dvo.ba.layer.layer.bundle_adjust`.
-        check: indices and weights, see :class:`dvo.ba.options.BAOptions`.
         factors: further measurements for bundle adjustment, for example of depth or of an inertial sensor.
         blocks: further unknowns that the factors concern, by name.
         kernel: robust kernel of the weighted residuals in bundle adjustment.
@@ -99,7 +98,6 @@ class StepOptions:
     iterations: int = 2
     damping: BADamping = BADamping()
     bounds: tuple[float, float] | None = None
-    check: bool | None = False
     factors: tuple[Factor, ...] = ()
     blocks: Mapping[str, StateBlock] = field(default_factory=dict)
     kernel: Kernel = Kernel()
@@ -184,7 +182,7 @@ def step(
         ``flow``, in which each edge moves by its own revision alone.
 
     Raises:
-        DvoError: invalid indices or weights, if ``options.check`` is set.
+        DvoError: factors or blocks that do not fit.
     """
     revision = revise(model, state, lookup)
     graph, targets, weights = state.graph, revision.targets, revision.weights
@@ -192,6 +190,8 @@ def step(
     if options.mode == "flow":
         return replace(state, coords=revision.coords + revision.delta[:, :, None, None])
     given = state.poses_cw, state.patches, state.intrinsics, targets, weights
+    # What a sensor gives may come from another package; all else is made here.
+    solve = adjust_dense if options.factors or options.blocks else dense_solution
     solved = solve(
         PatchProblem(*given, graph.ii, graph.jj, graph.kk, factors=options.factors, blocks=options.blocks),
         BAOptions(
@@ -200,8 +200,8 @@ def step(
             damping=options.damping,
             structure_only=options.mode == "structure",
             bounds=options.bounds,
-            check=options.check,
             kernel=options.kernel,
+            check=False,
         ),
     )
     return replace(state, poses_cw=solved.poses_cw, patches=solved.patches, states=solved.blocks)

@@ -116,14 +116,27 @@ def bundle_adjust(
 
 
 def adjust_dense(given: PatchProblem, options: BAOptions) -> BAResult:
-    """The dense solution of a batch; see :func:`bundle_adjust` and :func:`dvo.ba.solve.solve`."""
-    use_threads()
+    """The dense solution of a batch that is checked first; see :func:`bundle_adjust` and :func:`dvo.ba.solve.solve`."""
     check_structure(given)
     if is_transformed():
         return _transformed(given, options)
     given = _with_whole_indices(given)
     if options.check is not False:
         check_values(given)
+    return dense_solution(given, options)
+
+
+def dense_solution(given: PatchProblem, options: BAOptions) -> BAResult:
+    """The dense solution of a batch that is made by the caller: nothing of it is checked.
+
+    Args:
+        given: with indices of int64; not within ``torch.func``.
+        options: see :class:`BAOptions`; ``check`` does not count.
+
+    Returns:
+        As :func:`bundle_adjust`.
+    """
+    use_threads()
     if _is_for_device_kernels(given, options):
         return _by_device_kernels(given, options)
     with full_precision(given.poses_cw.device):

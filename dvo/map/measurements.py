@@ -1,8 +1,13 @@
-"""Measurements of an archive: edges between keyframes as arrays, and packed for keeping.
+"""Measurements of a map: edges between keyframes as arrays, and packed for keeping; and depths by a sensor.
 
 Most frames of a slow camera are dropped between two kept keyframes, and their measurements make up most of the memory
 of a map. A packed edge takes 9 bytes in place of 22: edges are sorted by their two keyframes, which are stored once for
 all of a pair, positions are rounded to 16 significant bits (0.001 feature pixels at 100) and weights to 4 (6 percent).
+
+The inverse depth of a patch that a sensor has measured has the prior ``w (d - d_measured)^2`` with
+``w = sigma^2 / var(d_measured)``: weights of bundle adjustment are confidences, of which 1 stands for the standard
+deviation ``sigma`` in feature pixels. A Cauchy kernel takes the influence from depths of another surface, which a rough
+registration gives near the edges of bodies.
 """
 
 from __future__ import annotations
@@ -11,6 +16,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.ba.factors import DepthPrior
+from dvo.ba.kernels import Kernel
+from dvo.ba.patch_problem import PatchProblem
+
+SIGMA = 0.061
+"""Standard deviation of a measurement of confidence 1 with the shipped weights, feature pixels (docs/precision.md)."""
+DEPTH_KERNEL = Kernel("cauchy", SIGMA)
+"""Robust kernel of measured depths: one standard deviation, as errors of depths have long tails."""
 
 _PAIR = 10  # bytes of a pair of keyframes: two int32, and the uint16 number of its edges
 _MAX_EDGES = 2**16 - 1  # edges of a pair
@@ -166,3 +182,38 @@ def pack_edges(edges: ArchivedEdges) -> PackedEdges:
     arrays = ends[starts].astype(np.int32), counts, patch, upper, weight
     data = np.concatenate([np.ascontiguousarray(array).reshape(-1).view(np.uint8) for array in arrays])
     return PackedEdges(data, len(starts), count)
+
+
+def depth_factors(measured: Tensor | None) -> tuple[DepthPrior, ...]:
+    """Priors of the patches whose depth was measured.
+
+    Args:
+        measured: ``(K, 2)`` inverse depths and weights, 0 for none; None without a depth camera.
+
+    Returns:
+        One factor of ``inverse_depths (1, K)``; none without measurements.
+    """
+    if measured is None:
+        return ()
+    index = (measured[:, 1] > 0).nonzero()[:, 0]
+    if not len(index):
+        return ()
+    value, weight = measured[index].unbind(1)
+    return (DepthPrior(value[None], weight[None], index, DEPTH_KERNEL),)
+
+
+def measured_depths(problem: PatchProblem) -> Tensor | None:
+    """What :func:`depth_factors` has made the priors of a problem of.
+
+    Args:
+        problem: one graph.
+
+    Returns:
+        ``(K, 2)`` inverse depths and weights, 0 for none; None without such priors.
+    """
+    found = None
+    for prior in problem.factors:
+        if isinstance(prior, DepthPrior) and prior.index is not None:
+            found = torch.zeros(len(problem.patches), 2).to(prior.value) if found is None else found
+            found[prior.index] = torch.stack([prior.value[0], prior.weight[0]], 1)
+    return found

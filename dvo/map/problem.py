@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dvo.ba.patch_problem import PatchProblem
 from dvo.map.archive import Archive, ArchivedKeyframe
-from dvo.map.measured_depths import depth_factors
+from dvo.map.measurements import depth_factors
 
 
 def archive_problem(

@@ -1,7 +1,7 @@
 """The scale that measured depths fix in bundle adjustment, which images leave open.
 
 The first pose alone is held, and scale is a free direction of the reprojection error: the priors of measured depths
-(:mod:`dvo.map.measured_depths`) decide it.
+(:func:`dvo.map.measurements.depth_factors`) decide it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def measured_share(measured: Tensor | None) -> float:
     """Share of the patches whose depth was measured.
 
     Args:
-        measured: see :func:`dvo.map.measured_depths.depth_factors`.
+        measured: see :func:`dvo.map.measurements.depth_factors`.
 
     Returns:
         In [0, 1].
@@ -38,7 +38,7 @@ def metres_of_unit(depths: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
     Args:
         depths: ``(K,)`` inverse depths in the unit of the map.
-        measured: ``(K, 2)`` see :func:`dvo.map.measured_depths.depth_factors`.
+        measured: ``(K, 2)`` see :func:`dvo.map.measurements.depth_factors`.
 
     Returns:
         ``(P,)`` of the patches with a measured depth, in order.
@@ -65,7 +65,7 @@ def to_measured(poses_cw: Tensor, depths: Tensor, measured: Tensor | None) -> tu
     Args:
         poses_cw: ``(N, 7)``; lengths are scaled from the origin of the world.
         depths: ``(K, ...)`` or ``(N, M)`` inverse depths of patches, of all of their pixels or of the centres.
-        measured: ``(K, 2)`` see :func:`dvo.map.measured_depths.depth_factors`.
+        measured: ``(K, 2)`` see :func:`dvo.map.measurements.depth_factors`.
 
     Returns:
         Poses and inverse depths of the same shapes.

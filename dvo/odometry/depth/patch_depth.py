@@ -20,7 +20,7 @@ import torch
 
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
-from dvo.map.measured_depths import SIGMA
+from dvo.map.measurements import SIGMA
 from dvo.models.patch_vo import PatchVO
 from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.odometry.depth.scale_options import ScaleOptions

@@ -23,7 +23,7 @@ from dvo.ba.options import COLD_UPDATES, damping_at
 from dvo.data.frame import Frame
 from dvo.geometry import se3
 from dvo.geometry.projection import Reprojection, reproject
-from dvo.map.measured_depths import SIGMA
+from dvo.map.measurements import SIGMA
 from dvo.map.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions
@@ -48,7 +48,7 @@ class StereoMatches:
     Attributes:
         inverse_depth: ``(M,)`` 1/m, that fits them best.
         weight: ``(M,)`` of the inverse depth in bundle adjustment, where 1 stands for the standard deviation
-            :data:`dvo.odometry.depth.depth_factor.SIGMA`.
+            :data:`dvo.map.measurements.SIGMA`.
         residual: ``(M,)`` distance of the measurement from the epipolar line, feature pixels.
         found: ``(M,)`` bool, the measurement lies in the image and its alignment was accepted.
         slopes: ``(M, 2)`` of the surfaces, see :class:`dvo.map.window.Keyframe`.

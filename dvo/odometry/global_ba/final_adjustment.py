@@ -26,7 +26,7 @@ from dvo.core.settings import check_settings
 from dvo.geometry import se3
 from dvo.map.correction import rescale
 from dvo.map.map import Map
-from dvo.map.measured_depths import measured_depths
+from dvo.map.measurements import measured_depths
 from dvo.map.recordings import count_earlier, increasing_times
 from dvo.odometry.depth.depth_factor import MEASURED_SHARE, far_scale, measured_share, to_measured
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter

@@ -22,7 +22,7 @@ from torch import Tensor
 from dvo.geometry import se3
 from dvo.map.archive import ArchivedKeyframe, encode_jpeg
 from dvo.map.keyframe_graph import KeyframeGraph
-from dvo.map.measured_depths import SIGMA
+from dvo.map.measurements import SIGMA
 from dvo.map.window import Keyframe, Window
 from dvo.nets.patch.patchifier import patch_coordinates
 from dvo.odometry.frames.front_end import View

@@ -11,7 +11,7 @@ from dvo.ba.kernels import Kernel
 from dvo.core.errors import DvoError
 from dvo.core.settings import check_names, check_settings, settings_of, shown
 from dvo.core.text import choice
-from dvo.map.measured_depths import SIGMA
+from dvo.map.measurements import SIGMA
 from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.odometry.depth.scale_options import ScaleOptions
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions

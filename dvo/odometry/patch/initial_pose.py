@@ -82,7 +82,7 @@ def first_depth(window: Window, config: TrackerConfig, initialised: bool, measur
         window: keyframes without the frame, possibly none.
         config: settings of the tracker.
         initialised: the tracker is.
-        measured: ``(M, 2)`` of the frame, see :func:`dvo.odometry.depth.depth_factor.depth_factors`.
+        measured: ``(M, 2)`` of the frame, see :func:`dvo.map.measurements.depth_factors`.
 
     Returns:
         ``(1, M)``.

@@ -34,7 +34,7 @@ from dvo.ba.multistart import Solution
 from dvo.ba.options import BADamping, BAOptions
 from dvo.ba.patch_problem import PatchProblem
 from dvo.core.context import in_own_context
-from dvo.map.measured_depths import depth_factors
+from dvo.map.measurements import depth_factors
 from dvo.map.window import Window
 from dvo.odometry.uncertainty.displacement import confidence_of, flow_metric
 from dvo.odometry.uncertainty.gauge import Gauge, window_gauge

@@ -13,7 +13,7 @@ from torch import Tensor
 from dvo.ba.kernels import Kernel
 from dvo.ba.options import COLD_UPDATES, damping_at
 from dvo.map.edges import PatchGraph
-from dvo.map.measured_depths import depth_factors
+from dvo.map.measurements import depth_factors
 from dvo.map.window import Keyframe, Window, WindowSnapshot
 from dvo.models.patch_vo import PatchVO
 from dvo.models.step import Revision, StepOptions, UpdateState, revise, step

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.geometry.camera import Camera
-from dvo.map.measured_depths import SIGMA
+from dvo.map.measurements import SIGMA
 from dvo.nets.alignment.alignment import align_patches
 from dvo.odometry.depth.patch_depth import checked_depth, followed_planes, variance_of_inverse
 from dvo.odometry.depth.scale_options import ScaleOptions

@@ -13,7 +13,7 @@ from dvo.data.frame import Frame, StereoView
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import invert_poses
-from dvo.map.measured_depths import SIGMA
+from dvo.map.measurements import SIGMA
 from dvo.metrics import evaluate
 from dvo.odometry.depth.patch_depth import followed_planes
 from dvo.odometry.depth.right_view import right_view

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.map.correction import rescale
-from dvo.map.measured_depths import depth_factors
+from dvo.map.measurements import depth_factors
 from dvo.metrics import evaluate
 from dvo.odometry.depth.depth_factor import measured_share, to_measured
 from dvo.odometry.depth.scale_options import ScaleOptions

@@ -17,7 +17,7 @@ from dvo.ba.layer.layer import BAOptions, make_problem
 from dvo.ba.layer.reference import dense_rows
 from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3
-from dvo.map.measured_depths import SIGMA, depth_factors
+from dvo.map.measurements import SIGMA, depth_factors
 from dvo.odometry.patch import tracker as tracker_module
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.protocol import Estimate, Status

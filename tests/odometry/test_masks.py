@@ -11,7 +11,7 @@ from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.metrics import evaluate
 from dvo.nets.patch.masks import in_sight
-from dvo.odometry.frames.content import missing_content
+from dvo.odometry.frames.gate import missing_content
 from dvo.odometry.load import build_odometry
 from dvo.odometry.load_map import load_map
 from dvo.odometry.protocol import Status

@@ -1,4 +1,4 @@
-"""Content of images: whether one shows anything, and whether two show the same scene."""
+"""Content of images: whether two show the same scene, and reasons in words of frames without a pose."""
 
 from __future__ import annotations
 
@@ -11,19 +11,6 @@ MATCHED = 0.15
 NO_MATCH = "no match with the frames before"
 TOO_LITTLE_MOTION, TOO_FEW, NO_FIT = "too little motion", "too few keyframes", "no motion fits the images"
 """Reasons of an odometry that is initialising."""
-MASK_MARGIN = 12
-"""Distance from ignored pixels within which nothing is measured: the size of a patch of three feature pixels, at a
-quarter of the resolution."""
-MASKED = "masked image"
-"""Reason of a loss of a frame of which its mask leaves too little."""
-
-_BLOCK = 8  # side of the blocks whose means show structure, pixels of the working image
-_CONTRAST = 2.5  # least difference of neighbouring blocks that counts as structure without noise, grey levels
-_NOISE = 6.0  # and its share of the expected difference of blocks of independent noise
-_STRONG_NOISE = 10.0  # difference of neighbouring pixels that sensor noise stays below, grey levels
-_DARK, _BRIGHT = 64.0, 192.0
-
-_LEAST_USED = 0.05  # share of the pixels that a mask leaves, beside a margin
 
 _WIDTH = 160  # of the images whose corners are matched, pixels
 _CORNERS = 150  # at most
@@ -32,60 +19,6 @@ _SIDE, _LEVELS = 15, 4  # of the windows, and halvings of the resolution
 _RETURN = 1.0  # largest distance of a corner from its start after the way there and back, pixels
 _DEVIATION = 48.0  # standard deviation that the images are brought to, grey levels
 _UNLIKE = 24.0  # mean difference of two windows above which they do not show the same, grey levels
-
-
-def missing_content(image: np.ndarray, mask: np.ndarray | None = None) -> str:
-    """Find out if an image shows nothing: its blocks differ no more than those of uniform light and sensor noise would.
-
-    Noise is estimated from the median difference of neighbouring pixels. The mean of an ``8x8`` block averages
-    independent noise to an eighth, while differences of a view grow with the distance. Strong noise could be a fine
-    texture; only the measurements in several images tell them apart.
-
-    Args:
-        image: ``(H, W, 3)`` uint8 RGB working image.
-        mask: ``(H, W)`` bool, the only pixels that are looked at; None for all. If less than a twentieth of them is
-            left beside a margin, the image is masked.
-
-    Returns:
-        Description, such as ``"black image"``; empty for an image with content.
-
-    Example:
-        >>> missing_content(np.zeros((240, 320, 3), np.uint8))
-        'black image'
-    """
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    if mask is not None:
-        return _missing_in_mask(grey, mask)
-    height, width = (max(2, side // _BLOCK) for side in grey.shape)
-    blocks = cv2.resize(grey.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    steps = np.concatenate([np.abs(np.diff(blocks, axis=axis)).ravel() for axis in (0, 1)])
-    structure = float(np.percentile(steps, 99))
-    noise = float(np.median(cv2.absdiff(grey[::4, 1:], grey[::4, :-1])))
-    return _judged(structure, noise, float(blocks.mean()))
-
-
-def _missing_in_mask(grey: np.ndarray, mask: np.ndarray) -> str:
-    """Description of an image of which a part is used, as :func:`missing_content`: by the blocks that lie in it."""
-    margin = np.ones((2 * MASK_MARGIN + 1,) * 2, np.uint8)
-    if cv2.erode(mask.astype(np.uint8), margin).mean() < _LEAST_USED:
-        return MASKED
-    height, width = (max(2, side // _BLOCK) for side in grey.shape)
-    share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    blocks = cv2.resize(grey * mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    blocks = np.where(share > 0.5, blocks / np.maximum(share, 0.5), np.nan)
-    steps = np.concatenate([np.abs(np.diff(blocks, axis=axis)).ravel() for axis in (0, 1)])
-    pairs = mask[::4, 1:] & mask[::4, :-1]
-    if not (np.isfinite(steps).any() and pairs.any()):
-        return MASKED
-    noise = float(np.median(cv2.absdiff(grey[::4, 1:], grey[::4, :-1])[pairs]))
-    return _judged(float(np.nanpercentile(steps, 99)), noise, float(np.nanmean(blocks)))
-
-
-def _judged(structure: float, noise: float, mean: float) -> str:
-    """Description of an image by the differences of its blocks and of its pixels, and its brightness."""
-    if noise > _STRONG_NOISE or structure > _CONTRAST + _NOISE * noise / _BLOCK:
-        return ""
-    return "black image" if mean < _DARK else "white image" if mean > _BRIGHT else "image without content"
 
 
 def matched_share(before: np.ndarray, after: np.ndarray) -> float:

@@ -21,12 +21,24 @@ from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
 from dvo.geometry.camera import Camera
-from dvo.odometry.frames.content import missing_content
 
 RECENT = 30
 """Number of intervals that the usual one is the median of."""
 _USUAL = ((6, 2), (RECENT, 3))  # among so many of the newest intervals, so many half as long make a long one usual
 _MULTIPLE = 8  # of which the sides of a working image are
+
+MASK_MARGIN = 12
+"""Distance from ignored pixels within which nothing is measured: the size of a patch of three feature pixels, at a
+quarter of the resolution."""
+MASKED = "masked image"
+"""Reason of a loss of a frame of which its mask leaves too little."""
+
+_BLOCK = 8  # side of the blocks whose means show structure, pixels of the working image
+_CONTRAST = 2.5  # least difference of neighbouring blocks that counts as structure without noise, grey levels
+_NOISE = 6.0  # and its share of the expected difference of blocks of independent noise
+_STRONG_NOISE = 10.0  # difference of neighbouring pixels that sensor noise stays below, grey levels
+_DARK, _BRIGHT = 64.0, 192.0
+_LEAST_USED = 0.05  # share of the pixels that a mask leaves, beside a margin
 
 
 @dataclass(frozen=True)
@@ -328,3 +340,57 @@ def working_image(frame: Frame, pixels: int | None) -> tuple[np.ndarray, Camera,
     if frame.mask is None:
         return image, camera, None
     return image, camera, cv2.resize(frame.mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+def missing_content(image: np.ndarray, mask: np.ndarray | None = None) -> str:
+    """Find out if an image shows nothing: its blocks differ no more than those of uniform light and sensor noise would.
+
+    Noise is estimated from the median difference of neighbouring pixels. The mean of an ``8x8`` block averages
+    independent noise to an eighth, while differences of a view grow with the distance. Strong noise could be a fine
+    texture; only the measurements in several images tell them apart.
+
+    Args:
+        image: ``(H, W, 3)`` uint8 RGB working image.
+        mask: ``(H, W)`` bool, the only pixels that are looked at; None for all. If less than a twentieth of them is
+            left beside a margin, the image is masked.
+
+    Returns:
+        Description, such as ``"black image"``; empty for an image with content.
+
+    Example:
+        >>> missing_content(np.zeros((240, 320, 3), np.uint8))
+        'black image'
+    """
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    if mask is not None:
+        return _missing_in_mask(grey, mask)
+    height, width = (max(2, side // _BLOCK) for side in grey.shape)
+    blocks = cv2.resize(grey.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    steps = np.concatenate([np.abs(np.diff(blocks, axis=axis)).ravel() for axis in (0, 1)])
+    structure = float(np.percentile(steps, 99))
+    noise = float(np.median(cv2.absdiff(grey[::4, 1:], grey[::4, :-1])))
+    return _judged(structure, noise, float(blocks.mean()))
+
+
+def _missing_in_mask(grey: np.ndarray, mask: np.ndarray) -> str:
+    """Description of an image of which a part is used, as :func:`missing_content`: by the blocks that lie in it."""
+    margin = np.ones((2 * MASK_MARGIN + 1,) * 2, np.uint8)
+    if cv2.erode(mask.astype(np.uint8), margin).mean() < _LEAST_USED:
+        return MASKED
+    height, width = (max(2, side // _BLOCK) for side in grey.shape)
+    share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    blocks = cv2.resize(grey * mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    blocks = np.where(share > 0.5, blocks / np.maximum(share, 0.5), np.nan)
+    steps = np.concatenate([np.abs(np.diff(blocks, axis=axis)).ravel() for axis in (0, 1)])
+    pairs = mask[::4, 1:] & mask[::4, :-1]
+    if not (np.isfinite(steps).any() and pairs.any()):
+        return MASKED
+    noise = float(np.median(cv2.absdiff(grey[::4, 1:], grey[::4, :-1])[pairs]))
+    return _judged(float(np.nanpercentile(steps, 99)), noise, float(np.nanmean(blocks)))
+
+
+def _judged(structure: float, noise: float, mean: float) -> str:
+    """Description of an image by the differences of its blocks and of its pixels, and its brightness."""
+    if noise > _STRONG_NOISE or structure > _CONTRAST + _NOISE * noise / _BLOCK:
+        return ""
+    return "black image" if mean < _DARK else "white image" if mean > _BRIGHT else "image without content"

@@ -30,9 +30,9 @@ from dvo.nets.patch.masks import visible_features
 from dvo.odometry.depth.depth_factor import MEASURED_SHARE, measured_share
 from dvo.odometry.depth.patch_depth import measure_depth
 from dvo.odometry.exclusive import exclusive
-from dvo.odometry.frames.content import NO_FIT, NO_MATCH, TOO_FEW, TOO_LITTLE_MOTION, missing_content
+from dvo.odometry.frames.content import NO_FIT, NO_MATCH, TOO_FEW, TOO_LITTLE_MOTION
 from dvo.odometry.frames.front_end import View, observe
-from dvo.odometry.frames.gate import Admitted, Gate
+from dvo.odometry.frames.gate import Admitted, Gate, missing_content
 from dvo.odometry.global_ba.graph_adjustment import AdjustmentRecord
 from dvo.odometry.global_ba.rolling_shutter import Shutter
 from dvo.odometry.loops.relocalisation import REFRESH_EVERY, hold_to_map, invite

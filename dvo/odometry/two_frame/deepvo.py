@@ -54,7 +54,7 @@ class RegressionConfig:
 class DeepVOOdometry:
     """Odometry of one sequence with :class:`dvo.models.deepvo.DeepVO`.
 
-    A frame has a pose if its image has content (:func:`dvo.odometry.frames.content.missing_content`) and shows the
+    A frame has a pose if its image has content (:func:`dvo.odometry.frames.gate.missing_content`) and shows the
     scene of the image before it (:func:`dvo.odometry.frames.content.matched_share`, since the network has no
     measurements of its own); the first one of a segment is its world. A frame that does not is lost. For want of
     measurements no step is taken across lost frames or a gap in time: the next segment begins, with a world and a scale

@@ -65,7 +65,8 @@ class Camera:
                 field="intrinsics",
                 remedy="give the calibration of this image size, or scale it",
             )
-        LENSES[self.model].check(self.coefficients, self.model)
+        if self.model != "none" or self.coefficients:
+            LENSES[self.model].check(self.coefficients, self.model)
         if not 0 <= self.readout <= 1:  # NaN fails too
             raise DvoError(
                 f"must be 0 to 1 s, got {self.readout:g}",

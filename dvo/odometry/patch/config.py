@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from dvo.ba.kernels import Kernel
@@ -206,7 +207,7 @@ class TrackerConfig:
         """How edges are measured, those of the window and between images that are not in it."""
         return StepSettings(self.kernel, self.alignment, self.align)
 
-    @property
+    @cached_property
     def policies(self) -> dict[Policy, InsertPolicy]:
         """How frames are tried in the window, by what they follow.
 
@@ -232,7 +233,7 @@ class TrackerConfig:
         """Mean flow since the last frame of the network up to which frames are aligned, feature pixels."""
         return 0.0 if self.align == "none" else min(self.network_motion, self.keyframe_motion / 2)
 
-    @property
+    @cached_property
     def variance(self) -> float:
         """Variance that covariances are scaled by, feature pixels squared."""
         return self.sigma**2 * self.covariance_scale

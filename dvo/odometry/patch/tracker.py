@@ -125,7 +125,9 @@ class PatchOdometry:
         self.patch_window = PatchWindow(self.model, self.window, config.measuring, self.device, self.sensors)
         self.aligner: FrameAlignment | None = None
         if config.aligned_motion > 0 and not self.sensors:
-            self.aligner = FrameAlignment(self.patch_window, config.alignment, config.motion_damping)
+            self.aligner = FrameAlignment(
+                self.patch_window, config.alignment, config.motion_damping, config.aligned_motion
+            )
         self.loops = loop_closer(self.model, config, self.graph, self.device, self.state, self.inertial.corrected)
 
     @property
@@ -198,10 +200,10 @@ class PatchOdometry:
         if self.aligner is None or state.phase is not Phase.TRACKING or window.guests or admitted.gap:
             return None
         image, camera = admitted.image, admitted.camera.intrinsics
-        found = self.aligner.align(image, camera, mask, record.timestamp, config.aligned_motion)
+        found = self.aligner.align(image, camera, mask, record.timestamp)
         if found is None:
             return None
-        if not (found.sure and found.slow) or found.motion > config.aligned_motion:
+        if not (found.sure and found.slow):
             state.guess = found.pose_cw if found.sure else None
             return None
         state.checks.see(len(self.graph.log.frames) - 1, image, camera, mask)

@@ -64,10 +64,8 @@ class AlignedFrame:
 
     Attributes:
         pose_cw: ``(7,)`` float64 world to camera.
-        motion: mean flow from the newest keyframe, feature pixels, see
-            :func:`dvo.odometry.window.motion.flow_magnitude`.
-        slow: the motion from the frame before is small (:data:`MAX_STEP`).
         sure: the pose is supported; otherwise it is a first guess.
+        slow: the motions from the newest keyframe and from the frame before (:data:`MAX_STEP`) are small.
         grey: ``(H, W)`` uint8 image of the frame.
         kk: ``(e,)`` patches of the window that agree with it.
         targets: ``(e, 2)`` float32 their positions in the frame, feature pixels.
@@ -75,9 +73,8 @@ class AlignedFrame:
     """
 
     pose_cw: np.ndarray
-    motion: float
-    slow: bool
     sure: bool
+    slow: bool
     grey: np.ndarray
     kk: np.ndarray
     targets: np.ndarray
@@ -100,13 +97,14 @@ class FrameAlignment:
         window: keyframes and their images.
         options: of the sub-pixel alignment.
         damping: of the motion model, see :func:`dvo.odometry.patch.initial_pose.predict_pose`.
+        limit: motion above which the network measures a frame, feature pixels.
 
     Attributes:
         age: frames that were aligned since the network has measured one.
     """
 
-    def __init__(self, window: PatchWindow, options: AlignmentOptions, damping: float) -> None:
-        self.patch_window, self.damping = window, damping
+    def __init__(self, window: PatchWindow, options: AlignmentOptions, damping: float, limit: float) -> None:
+        self.patch_window, self.damping, self.limit = window, damping, limit
         self.options = replace(options, slope=0.0)
         self.age = 0
         self._poses: torch.Tensor | None = None  # of the window that it goes on from
@@ -114,8 +112,9 @@ class FrameAlignment:
         self._patches: _Patches
         self._base: np.ndarray  # brightness and sharpness of the newest keyframe
 
-    def align(self, image: np.ndarray, intrinsics: np.ndarray, mask: np.ndarray | None, time: float, limit: float
-              ) -> AlignedFrame | None:  # fmt: skip
+    def align(
+        self, image: np.ndarray, intrinsics: np.ndarray, mask: np.ndarray | None, time: float
+    ) -> AlignedFrame | None:
         """Align a frame.
 
         Args:
@@ -123,7 +122,6 @@ class FrameAlignment:
             intrinsics: ``(4,)`` fx fy cx cy of it.
             mask: ``(H, W)`` bool, False for ignored pixels; None: none.
             time: of the frame, seconds.
-            limit: motion above which the network measures a frame, feature pixels.
 
         Returns:
             The frame; None where the motion model already expects twice the limit, or nothing can be aligned.
@@ -132,7 +130,7 @@ class FrameAlignment:
         self._begin(window, intrinsics)
         if self.age >= MAX_AGE:
             return None
-        patches = self._patches
+        patches, limit = self._patches, self.limit
         start = _predicted(self._last, time, self.damping)
         last = self._last[-1]
         if not len(patches.kk) or patches.motion(start) > 2 * limit or patches.motion(start, last.matrix) > limit / 2:
@@ -148,11 +146,11 @@ class FrameAlignment:
         if found is None:
             return None
         pose, sure, kept, measured = found
-        slow = patches.motion(pose, last.matrix) <= MAX_STEP * limit
+        slow = patches.motion(pose, last.matrix) <= MAX_STEP * limit and patches.motion(pose) <= limit
         targets = (measured / ModelConfig.STRIDE).astype(np.float32)
         confidence = patches.confidence[kept].astype(np.float32)
         rigid = poses_from_matrices(pose)
-        return AlignedFrame(rigid, patches.motion(pose), slow, sure, grey, patches.kk[kept], targets, confidence)
+        return AlignedFrame(rigid, sure, slow, grey, patches.kk[kept], targets, confidence)
 
     def keep(self, frame: AlignedFrame, time: float) -> None:
         """Go on from an aligned frame.

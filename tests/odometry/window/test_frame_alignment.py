@@ -59,7 +59,9 @@ def walked(odometry, frames: list[Frame]) -> tuple[list[Estimate], Others]:
     pictures = (image, (image * 0.8).astype(np.uint8), cv2.add(image, (20,) * 3), cv2.GaussianBlur(image, (0, 0), 2.0))
     with torch.inference_mode():
         camera, time = middle.camera.intrinsics, middle.timestamp
-        found = [odometry.aligner.align(picture, camera, None, time, limit=5.0) is not None for picture in pictures]
+        limit, odometry.aligner.limit = odometry.aligner.limit, 5.0
+        found = [odometry.aligner.align(picture, camera, None, time) is not None for picture in pictures]
+        odometry.aligner.limit = limit
     estimates += [odometry.track(frame) for frame in frames[MIDDLE:]]
     before, lost = len(aligned(odometry)), []
     for number, view in enumerate(film(4, family="street")[0], len(frames)):

@@ -24,7 +24,7 @@ from dvo.ba.layer.grouped import GroupedReprojection, group_measurements
 from dvo.ba.layer.reprojection import MARGIN, PatchReprojection
 from dvo.ba.layer.step import normal_equations
 from dvo.ba.layer.transforms import composed, finite, pulled_back
-from dvo.ba.options import BADamping
+from dvo.ba.options import BADamping, BAOptions
 from dvo.ba.problem import Factor, Linearisation, NormalEquations, Problem, State
 from dvo.core.kernels import is_transformed, use_kernels
 from dvo.geometry.bounds import MIN_Z_VALID
@@ -141,6 +141,52 @@ def measured_edges(
     )  # fmt: skip
 
 
+def take_steps(
+    poses_cw: Tensor,
+    depths: Tensor,
+    centres: Tensor,
+    intrinsics: Tensor,
+    targets: Tensor,
+    weights: Tensor,
+    ii: Tensor,
+    jj: Tensor,
+    kk: Tensor,
+    fixed: int,
+    options: BAOptions,
+) -> tuple[Tensor, Tensor] | None:
+    """Gauss-Newton steps of a batch whose only factor is the reprojection, and whose poses and depths move.
+
+    Args:
+        poses_cw: ``(B, N, 7)``. depths: ``(B, K)``. centres: ``(B, K, 2)``. intrinsics: ``(B, N, 4)``.
+        targets, weights: ``(B, E, 2)``. All float32 on the CPU.
+        ii, jj, kk: ``(E,)`` int64.
+        fixed: number of leading poses that stay.
+        options: bounds, kernel, damping, number of steps.
+
+    Returns:
+        New poses and inverse depths; None for an index out of range.
+    """
+    gate: dict[str, Any] = dict(max_residual=options.max_residual, bounds=options.bounds, kernel=options.kernel)
+    factor = measured_edges(centres, intrinsics, targets, weights, ii, jj, kk, **gate)
+    if factor is None:
+        return None
+    place = np.arange(poses_cw.shape[1]) - fixed
+    rows, size = np.where(place < 0, -1, 6 * place), 6 * (poses_cw.shape[1] - fixed)
+    settings = _Settings(options.iterations, options.damping, options.depth_range)
+    constants: tuple[Any, ...] = (*factor._edges(), rows, size, True, *factor._gate(), *settings.numbers())
+    return _advanced((poses_cw, depths, centres, intrinsics, targets, weights), constants, options.iterations)
+
+
+def _advanced(tensors: Sequence[Tensor], constants: tuple[Any, ...], iterations: int) -> tuple[Tensor, Tensor]:
+    """New poses and inverse depths, from these, what measures them, and the other arguments of the kernel."""
+    from dvo.ba.layer.edgewise_kernels import take_steps
+
+    poses, inverse_depths, *measured = (x.detach().contiguous().numpy() for x in tensors)
+    poses, inverse_depths = poses.copy(), inverse_depths.copy()
+    take_steps(poses, inverse_depths, *measured, *constants, int(iterations))
+    return torch.from_numpy(poses), torch.from_numpy(inverse_depths)
+
+
 def _rows(state: State) -> Array:
     """First row ``(N,)`` of each pose in the reduced system, -1 for one that stays."""
     poses = state[POSES]
@@ -200,19 +246,13 @@ def _constants(problem: Problem, settings: _Settings) -> tuple[Any, ...]:
 
 def _taken(path: list[Array] | None, problem: Problem, settings: _Settings, *tensors: Tensor) -> tuple[Tensor, ...]:
     """New poses and inverse depths; values of both before each step are added to the path."""
-    from dvo.ba.layer.edgewise_kernels import take_steps
-
-    poses, inverse_depths, *measured = (x.detach().contiguous().numpy() for x in tensors)
-    poses, inverse_depths = poses.copy(), inverse_depths.copy()
-    arguments: tuple[Any, ...] = (poses, inverse_depths, *measured, *_constants(problem, settings))
-    count: tuple[Any, ...] = (int(settings.iterations) if path is None else 1,)
+    constants = _constants(problem, settings)
     if path is None:
-        take_steps(*arguments, *count)
-    else:
-        for _ in range(settings.iterations):
-            path += [poses.copy(), inverse_depths.copy()]
-            take_steps(*arguments, *count)
-    return torch.from_numpy(poses), torch.from_numpy(inverse_depths)
+        return _advanced(tensors, constants, settings.iterations)
+    for _ in range(settings.iterations):
+        path += [x.detach().numpy().copy() for x in tensors[:2]]
+        tensors = *_advanced(tensors, constants, 1), *tensors[2:]
+    return tensors[0], tensors[1]
 
 
 def _by_twin(problem: Problem, settings: _Settings, *tensors: Tensor) -> tuple[Tensor, ...]:

@@ -10,7 +10,7 @@ Patch Visual Odometry", 2023.)
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, replace
 from typing import Any
 
@@ -137,8 +137,8 @@ def dense_solution(given: PatchProblem, options: BAOptions) -> BAResult:
         As :func:`bundle_adjust`.
     """
     use_threads()
-    if _is_for_device_kernels(given, options):
-        return _by_device_kernels(given, options)
+    if (found := _by_window_kernels(given, options)) is not None:
+        return found
     with full_precision(given.poses_cw.device):
         problem = _solved(make_problem(given, options), options)
         state, patches, dtype = problem.state, given.patches, _computed(given.poses_cw.dtype)
@@ -160,30 +160,38 @@ def dense_solution(given: PatchProblem, options: BAOptions) -> BAResult:
         return BAResult(poses_cw, patches, intrinsics, cost, inliers, covariance, further)
 
 
-def _is_for_device_kernels(given: PatchProblem, options: BAOptions) -> bool:
-    """The problem of a tracker's window: one camera, nothing but the reprojection, leading poses that stay."""
-    floats = given.poses_cw, given.patches, given.intrinsics, given.targets, given.weights
+def _by_window_kernels(given: PatchProblem, options: BAOptions) -> BAResult | None:
+    """The problem of a tracker's window by one call of kernels: one camera, nothing but the reprojection, leading poses
+    that stay. None for another problem, and where there are no kernels for it."""
     if given.sensors is not None or given.factors or given.blocks or options.refine_intrinsics != "none":
-        return False
+        return None
     if options.structure_only or options.motion_only or options.report or options.covariance is not None:
-        return False
-    if not use_device_kernels(*floats) or not isinstance(options.fixed, int) or isinstance(options.fixed, bool):
-        return False
-    from dvo.ba.layer.edgewise_triton import MOST_FRAMES, MOST_FREE
-
-    frames, patches = given.poses_cw.shape[1], given.patches.shape[1]
-    fits = frames <= MOST_FRAMES and options.fixed >= 0 and 0 < frames - options.fixed <= MOST_FREE
-    return fits and min(patches, len(given.ii)) > 0
-
-
-def _by_device_kernels(given: PatchProblem, options: BAOptions) -> BAResult:
-    from dvo.ba.layer.edgewise_triton import take_steps
-
-    assert isinstance(options.fixed, int)
+        return None
+    fixed, frames = options.fixed, given.poses_cw.shape[1]
+    if not isinstance(fixed, int) or isinstance(fixed, bool) or not 0 <= fixed < frames:
+        return None
+    take_steps = _kernels_of(given, frames - fixed)
+    if take_steps is None:
+        return None
     measured = given.centres, given.intrinsics, given.targets, given.weights, given.ii, given.jj, given.kk
-    poses_cw, depths = take_steps(given.poses_cw, given.inverse_depths, *measured, options.fixed, options)
-    row = depths[:, :, None, None, None].expand_as(given.patches[:, :, :1])
-    return BAResult(poses_cw, torch.cat((given.patches[:, :, :2], row), 2), given.intrinsics, blocks={})
+    found = take_steps(given.poses_cw, given.inverse_depths, *measured, fixed, options)
+    if found is None:
+        return None
+    row = found[1][:, :, None, None, None].expand_as(given.patches[:, :, :1])
+    return BAResult(found[0], torch.cat((given.patches[:, :, :2], row), 2), given.intrinsics, blocks={})
+
+
+def _kernels_of(given: PatchProblem, free: int) -> Callable[..., tuple[Tensor, Tensor] | None] | None:
+    """Steps of a window with a number of free poses on the device of its tensors; None for the twin."""
+    floats = given.poses_cw, given.patches, given.intrinsics, given.targets, given.weights
+    if use_kernels(*floats):
+        return edgewise.take_steps
+    if not use_device_kernels(*floats) or not min(given.patches.shape[1], len(given.ii)):
+        return None
+    from dvo.ba.layer import edgewise_triton
+
+    fits = given.poses_cw.shape[1] <= edgewise_triton.MOST_FRAMES and free <= edgewise_triton.MOST_FREE
+    return edgewise_triton.take_steps if fits else None
 
 
 def _solved(problem: Problem, options: BAOptions) -> Problem:

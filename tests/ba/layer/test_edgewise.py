@@ -100,7 +100,10 @@ def test_steps_are_those_of_the_twin(
     options = BAOptions(**changes, report=True)
     made = make_problem(PatchProblem(*p.arguments()), options)
     assert isinstance(made.factors[0], EdgewiseReprojection)
-    assert_equal(solved(p, options, torch.float32), solved(p, options, torch.float64))
+    found = solved(p, options, torch.float32)
+    assert_equal(found, solved(p, options, torch.float64))
+    at_once = solved(p, replace(options, report=False), torch.float32)  # as the window of a tracker
+    assert torch.equal(at_once.poses_cw, found.poses_cw) and torch.equal(at_once.patches, found.patches)
 
 
 @pytest.mark.parametrize("changes", [{}, {"structure_only": True}, {"motion_only": True}, {"fixed": 0}], ids=str)

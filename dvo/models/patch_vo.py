@@ -10,16 +10,17 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from functools import partial
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from dvo.ba.options import damping_at
+from dvo.ba.options import BAOptions, damping_at
 from dvo.geometry import se3
 from dvo.map.edges import PatchGraph
 from dvo.models.schedule import Stage, to_device, training_schedule
-from dvo.models.step import Mode, StepOptions, UpdateState, recent_depth, step
+from dvo.models.step import UpdateState, flow_step, recent_depth, step
 from dvo.nets.correlation.correlation import Correlation, CorrelationVolume
 from dvo.nets.patch.config import PRESETS, ModelConfig
 from dvo.nets.patch.frame_encoder import FrameEncoder
@@ -28,6 +29,9 @@ from dvo.nets.patch.selection import SELECTIONS, PatchSelection
 from dvo.nets.update.update import UPDATE_OPERATORS
 
 __all__ = ["Mode", "PatchVO", "UpdateState"]
+
+Mode = Literal["joint", "structure", "flow"]
+"""``joint`` refines poses and depths, ``structure`` depths alone; ``flow`` skips bundle adjustment."""
 
 
 class PatchVO(nn.Module):
@@ -127,7 +131,7 @@ class PatchVO(nn.Module):
                 it, except in mode ``structure``, which holds poses as given.
             inverse_depth: of each patch at the start, 1 if None (clips are normalised to median depth 1; a random
                 start ruins bundle adjustment at small resolution).
-            mode: see :data:`dvo.models.step.Mode`. ``flow`` trains the flow revision alone, at the lowest cost; it
+            mode: see :data:`Mode`. ``flow`` trains the flow revision alone, at the lowest cost; it
                 needs a schedule in which no frame joins later.
             generator: of the patch centres and of the edges that train the features; on the CPU. With a generator for
                 each clip, the draws of a clip do not depend on the other clips of the batch.
@@ -178,10 +182,14 @@ class PatchVO(nn.Module):
                 frames, coords = stage.frames, None
             present = scaled[:, :frames]
             state = UpdateState(stage.graph, poses, patches, present, context, hidden, coords)
-            options = StepOptions(mode, 1, ba_iterations, damping_at(update), (width, height))
-            state = step(self, state, lookup, options)
-            if state.coords is None:
-                state = state.reprojected()
+            if mode == "flow":
+                state = flow_step(self, state, lookup)
+            else:
+                options = BAOptions(
+                    iterations=ba_iterations, damping=damping_at(update), structure_only=mode == "structure",
+                    bounds=(width, height),
+                )  # fmt: skip
+                state = step(self, state, lookup, options).reprojected()
             yield state
 
     def draw_centres(

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol
+from typing import Protocol
 
 from torch import Tensor
 
 from dvo.ba.blocks import StateBlock
-from dvo.ba.kernels import Kernel
 from dvo.ba.layer.layer import adjust_dense, dense_solution
-from dvo.ba.options import BADamping, BAOptions
+from dvo.ba.options import BAOptions
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor
 from dvo.geometry.projection import reproject
@@ -25,9 +24,6 @@ from dvo.map.edges import PatchGraph
 from dvo.nets.correlation.correlation import CorrelationLookup
 from dvo.nets.patch.masks import in_sight
 from dvo.nets.update.update import UpdateOperator
-
-Mode = Literal["joint", "structure", "flow"]
-"""``joint`` refines poses and depths, ``structure`` depths alone; ``flow`` skips bundle adjustment."""
 
 
 @dataclass(frozen=True)
@@ -76,31 +72,6 @@ class UpdateState:
         graph = self.graph
         found = reproject(self.poses_cw, self.patches, self.intrinsics, graph.ii, graph.jj, graph.kk)
         return replace(self, coords=found.coords)
-
-
-@dataclass(frozen=True)
-class StepOptions:
-    """Options of a step.
-
-    Attributes:
-        mode: see :data:`Mode`.
-        fixed: number of leading poses that bundle adjustment holds.
-        iterations: Gauss-Newton iterations.
-        damping: of bundle adjustment.
-        bounds: ``(width, height)`` of the feature map, see :func:`dvo.ba.layer.layer.bundle_adjust`.
-        factors: further measurements for bundle adjustment, for example of depth or of an inertial sensor.
-        blocks: further unknowns that the factors concern, by name.
-        kernel: robust kernel of the weighted residuals in bundle adjustment.
-    """
-
-    mode: Mode = "joint"
-    fixed: int = 1
-    iterations: int = 2
-    damping: BADamping = BADamping()
-    bounds: tuple[float, float] | None = None
-    factors: tuple[Factor, ...] = ()
-    blocks: Mapping[str, StateBlock] = field(default_factory=dict)
-    kernel: Kernel = Kernel()
 
 
 @dataclass(frozen=True)
@@ -167,7 +138,10 @@ def step(
     model: StepModel,
     state: UpdateState,
     lookup: CorrelationLookup,
-    options: StepOptions = StepOptions(),  # noqa: B008
+    options: BAOptions,
+    *,
+    factors: tuple[Factor, ...] = (),
+    blocks: Mapping[str, StateBlock] | None = None,
 ) -> UpdateState:
     """Revise the flow of all edges, then fit poses and inverse depths to it by bundle adjustment.
 
@@ -175,36 +149,40 @@ def step(
         model: provides the update operator, for instance a :class:`dvo.models.patch_vo.PatchVO`.
         state: edges, poses and patches to start from. Detach poses and patches to cut gradients between steps.
         lookup: correlation of patches and feature maps.
-        options: mode, fixed poses, damping.
+        options: of bundle adjustment; values are not checked.
+        factors: further measurements, for example of depth or of an inertial sensor.
+        blocks: further unknowns that the factors concern, by name.
 
     Returns:
-        The state with new poses, patches, hidden state, targets and confidence. ``coords`` is None, except in mode
-        ``flow``, in which each edge moves by its own revision alone.
+        The state with new poses, patches, hidden state, targets and confidence, and without ``coords``.
 
     Raises:
         DvoError: factors or blocks that do not fit.
     """
-    revision = revise(model, state, lookup)
-    graph, targets, weights = state.graph, revision.targets, revision.weights
-    state = replace(state, hidden=revision.hidden, targets=targets, confidence=weights, coords=None)
-    if options.mode == "flow":
-        return replace(state, coords=revision.coords + revision.delta[:, :, None, None])
-    given = state.poses_cw, state.patches, state.intrinsics, targets, weights
+    revision, graph = revise(model, state, lookup), state.graph
+    given = state.poses_cw, state.patches, state.intrinsics, revision.targets, revision.weights
+    problem = PatchProblem(*given, graph.ii, graph.jj, graph.kk, factors=factors, blocks=blocks or {})
     # What a sensor gives may come from another package; all else is made here.
-    solve = adjust_dense if options.factors or options.blocks else dense_solution
-    solved = solve(
-        PatchProblem(*given, graph.ii, graph.jj, graph.kk, factors=options.factors, blocks=options.blocks),
-        BAOptions(
-            fixed=options.fixed,
-            iterations=options.iterations,
-            damping=options.damping,
-            structure_only=options.mode == "structure",
-            bounds=options.bounds,
-            kernel=options.kernel,
-            check=False,
-        ),
-    )
-    return replace(state, poses_cw=solved.poses_cw, patches=solved.patches, states=solved.blocks)
+    further = factors or blocks
+    solved = adjust_dense(problem, replace(options, check=False)) if further else dense_solution(problem, options)
+    return replace(
+        state, hidden=revision.hidden, targets=revision.targets, confidence=revision.weights, coords=None,
+        poses_cw=solved.poses_cw, patches=solved.patches, states=solved.blocks,
+    )  # fmt: skip
+
+
+def flow_step(model: StepModel, state: UpdateState, lookup: CorrelationLookup) -> UpdateState:
+    """Revise the flow of all edges, each of which moves by its own revision alone; poses and depths do not change.
+
+    Args:
+        model, state, lookup: see :func:`step`.
+
+    Returns:
+        The state with new hidden state, targets, confidence and ``coords``.
+    """
+    revision = revise(model, state, lookup)
+    coords = revision.coords + revision.delta[:, :, None, None]
+    return replace(state, hidden=revision.hidden, targets=revision.targets, confidence=revision.weights, coords=coords)
 
 
 def recent_depth(patches: Tensor, per_frame: int, frames: int) -> Tensor:

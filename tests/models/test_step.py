@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from dvo.ba.factors import DepthPrior
-from dvo.ba.options import damping_at
+from dvo.ba.options import BAOptions, damping_at
 from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.map.window import Keyframe
 from dvo.models.patch_vo import PatchVO
 from dvo.models.schedule import training_schedule
-from dvo.models.step import StepOptions, UpdateState, recent_depth, revise, step
+from dvo.models.step import UpdateState, flow_step, recent_depth, revise, step
 from dvo.nets.correlation.correlation import Correlation, correlate_reference
 from dvo.nets.patch.config import preset
 from dvo.nets.patch.patchifier import normalise_images, patch_coordinates
@@ -72,7 +72,7 @@ def test_both_loops_take_the_same_steps_on_one_graph(model, clip):
     )  # fmt: skip
     window, stepper = as_window(model, clip, torch.Generator().manual_seed(5))
     for update, state in enumerate(unrolled):
-        stepper.step(StepOptions(damping=damping_at(update)))
+        stepper.step(BAOptions(damping=damping_at(update)))
         for ours, theirs in (
             (window.poses_cw, state.poses_cw), (window.patches, state.patches), (window.hidden, state.hidden),
             (window.targets, state.targets), (window.weights, state.confidence),
@@ -116,12 +116,12 @@ def start(model, clip):
 def test_modes(model, clip):
     state, lookup, bounds = start(model, clip)
     revision = revise(model, state, lookup)
-    flow = step(model, state, lookup, StepOptions(mode="flow"))
+    flow = flow_step(model, state, lookup)
     assert torch.equal(flow.poses_cw, state.poses_cw) and torch.equal(flow.patches, state.patches)
     torch.testing.assert_close(flow.coords[:, :, 1, 1], revision.targets)
-    structure = step(model, state, lookup, StepOptions(mode="structure", bounds=bounds))
+    structure = step(model, state, lookup, BAOptions(structure_only=True, bounds=bounds))
     assert torch.equal(structure.poses_cw, state.poses_cw) and structure.coords is None
-    joint = step(model, state, lookup, StepOptions(fixed=2, bounds=bounds))
+    joint = step(model, state, lookup, BAOptions(fixed=2, bounds=bounds))
     assert torch.equal(joint.poses_cw[:, :2], state.poses_cw[:, :2])
     assert not torch.equal(joint.poses_cw[:, 2:], state.poses_cw[:, 2:])
 
@@ -132,7 +132,7 @@ def test_further_factors_take_part(model, clip):
     state, lookup, bounds = start(model, clip)
     wanted = torch.full((1, FRAMES * PATCHES), 0.7)
     prior = DepthPrior(wanted, torch.full_like(wanted, 1e6))
-    after = step(model, state, lookup, StepOptions(bounds=bounds, factors=(prior,)))
+    after = step(model, state, lookup, BAOptions(bounds=bounds), factors=(prior,))
     torch.testing.assert_close(after.patches[:, :, 2, 1, 1], wanted, atol=1e-3, rtol=0)
 
 
@@ -160,7 +160,7 @@ def test_the_update_operator_is_exchanged_by_a_word(clip):
 
 def test_gradients_reach_encoder_and_operator(model, clip):
     state, lookup, bounds = start(model, clip)
-    after = step(model, state, lookup, StepOptions(bounds=bounds))
+    after = step(model, state, lookup, BAOptions(bounds=bounds))
     loss = after.targets.square().mean() + after.confidence.mean() + after.poses_cw[..., :3].square().sum()
     gradients = torch.autograd.grad(loss, [*model.parameters()], allow_unused=True)
     assert sum(g is not None and bool(g.abs().sum() > 0) for g in gradients) > 0.9 * len(gradients)

@@ -19,14 +19,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from dvo.ba.options import COLD_UPDATES, damping_at
+from dvo.ba.options import COLD_UPDATES, BAOptions, damping_at
 from dvo.data.frame import Frame
 from dvo.geometry import se3
 from dvo.geometry.projection import Reprojection, reproject
 from dvo.map.measurements import SIGMA
 from dvo.map.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
-from dvo.models.step import StepOptions
 from dvo.nets.patch.patchifier import Features, patch_coordinates
 from dvo.odometry.depth.right_view import RightView, right_view
 from dvo.odometry.frames.front_end import Observation, encode_image
@@ -119,7 +118,7 @@ def match_right(
     depth = search_line(seen.matching, seen.centres[0, 0].to(pose), right, focal, pose)[0][None]
     pair = _pair(model, seen, features, view.image, intrinsics, pose, depth, settings)
     for _ in range(_UPDATES):
-        pair.step(StepOptions(mode="structure", fixed=2, damping=damping_at(COLD_UPDATES)))
+        pair.step(BAOptions(fixed=2, structure_only=True, damping=damping_at(COLD_UPDATES)))
     pair.finalise(torch.arange(len(pair.window.kk), device=device))
     return _fitted(pair.window, seen.bounds, deviation)
 

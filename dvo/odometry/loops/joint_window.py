@@ -15,14 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.options import COLD_UPDATES, damping_at
+from dvo.ba.options import COLD_UPDATES, BAOptions, damping_at
 from dvo.geometry import se3, so3
 from dvo.map.archive import ArchivedKeyframe
 from dvo.map.features import FeatureCache
 from dvo.map.measurements import ArchivedEdges
 from dvo.map.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
-from dvo.models.step import StepOptions
 from dvo.nets.patch.patchifier import patch_coordinates
 from dvo.odometry.frames.front_end import encode_image
 from dvo.odometry.window.patch_window import PatchWindow, StepSettings
@@ -109,7 +108,7 @@ class GroupMatcher:
             for _ in range(number):
                 yield
                 start = _newer(window, count)
-                joint.step(StepOptions(fixed=count, damping=damping_at(COLD_UPDATES)))
+                joint.step(BAOptions(fixed=count, damping=damping_at(COLD_UPDATES)))
                 if row == len(decisions) - 1 and _is_settled(start, _newer(window, count)):
                     break
             share = related_share(window, across)

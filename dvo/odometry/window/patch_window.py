@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
-from dvo.ba.options import COLD_UPDATES, damping_at
+from dvo.ba.options import COLD_UPDATES, BAOptions, damping_at
 from dvo.map.edges import PatchGraph
 from dvo.map.measurements import depth_factors
 from dvo.map.window import Keyframe, Window, WindowSnapshot
 from dvo.models.patch_vo import PatchVO
-from dvo.models.step import Revision, StepOptions, UpdateState, revise, step
+from dvo.models.step import Revision, UpdateState, revise, step
 from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.nets.correlation.correlation import Correlation
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation
@@ -302,7 +302,7 @@ class PatchWindow:
         """
         fixed = self.window.fixed(optimised)
         for _ in range(count):
-            self.step(StepOptions(fixed=fixed, damping=damping_at(COLD_UPDATES)))
+            self.step(BAOptions(fixed=fixed, damping=damping_at(COLD_UPDATES)))
 
     def snapshot(self) -> Snapshot:
         """Record everything that steps and one new frame change, for :meth:`restore`."""
@@ -358,18 +358,18 @@ class PatchWindow:
         window.targets, window.weights = revision.targets[0], revision.weights[0]
         window.confidence = revision.weights[0]
 
-    def step(self, options: StepOptions) -> None:
+    def step(self, options: BAOptions) -> None:
         """Take a step and store its result in the window, see :func:`dvo.models.step.step`.
 
         Args:
-            options: of the step; ``bounds`` are replaced by those of the feature map, and ``kernel`` by that of the
-                settings; measured depths and the sensors of the window join its factors.
+            options: of bundle adjustment; ``bounds`` are replaced by those of the feature map, and ``kernel`` by that
+                of the settings. Measured depths and the sensors of the window give further factors.
         """
-        factors = *options.factors, *depth_factors(self.window.measured), *depth_factors(self.window.prior)
+        factors = *depth_factors(self.window.measured), *depth_factors(self.window.prior)
         factors += tuple(factor for sensor in self.sensors for factor in sensor.factors(self.window))
         blocks = {name: block for sensor in self.sensors for name, block in sensor.blocks(self.window).items()}
-        options = replace(options, bounds=self.bounds, kernel=self.settings.kernel, factors=factors, blocks=blocks)
-        after = step(self.model, self.state(), self.correlation, options)
+        options = replace(options, bounds=self.bounds, kernel=self.settings.kernel)
+        after = step(self.model, self.state(), self.correlation, options, factors=factors, blocks=blocks)
         assert after.targets is not None and after.confidence is not None
         window = self.window
         window.poses_cw, window.patches, window.hidden = after.poses_cw[0], after.patches[0], after.hidden[0]

@@ -72,7 +72,7 @@ def test_both_loops_take_the_same_steps_on_one_graph(model, clip):
     )  # fmt: skip
     window, stepper = as_window(model, clip, torch.Generator().manual_seed(5))
     for update, state in enumerate(unrolled):
-        stepper.step(BAOptions(damping=damping_at(update)))
+        stepper.step(1, damping_at(update))
         for ours, theirs in (
             (window.poses_cw, state.poses_cw), (window.patches, state.patches), (window.hidden, state.hidden),
             (window.targets, state.targets), (window.weights, state.confidence),

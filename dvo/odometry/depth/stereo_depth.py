@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from dvo.ba.options import COLD_UPDATES, BAOptions, damping_at
 from dvo.data.frame import Frame
 from dvo.geometry import se3
 from dvo.geometry.projection import Reprojection, reproject
@@ -118,7 +117,7 @@ def match_right(
     depth = search_line(seen.matching, seen.centres[0, 0].to(pose), right, focal, pose)[0][None]
     pair = _pair(model, seen, features, view.image, intrinsics, pose, depth, settings)
     for _ in range(_UPDATES):
-        pair.step(BAOptions(fixed=2, structure_only=True, damping=damping_at(COLD_UPDATES)))
+        pair.step(2, structure_only=True)
     pair.finalise(torch.arange(len(pair.window.kk), device=device))
     return _fitted(pair.window, seen.bounds, deviation)
 

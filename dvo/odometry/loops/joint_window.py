@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.options import COLD_UPDATES, BAOptions, damping_at
 from dvo.geometry import se3, so3
 from dvo.map.archive import ArchivedKeyframe
 from dvo.map.features import FeatureCache
@@ -108,7 +107,7 @@ class GroupMatcher:
             for _ in range(number):
                 yield
                 start = _newer(window, count)
-                joint.step(BAOptions(fixed=count, damping=damping_at(COLD_UPDATES)))
+                joint.step(count)
                 if row == len(decisions) - 1 and _is_settled(start, _newer(window, count)):
                     break
             share = related_share(window, across)

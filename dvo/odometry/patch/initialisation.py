@@ -13,7 +13,7 @@ from dvo.ba.multistart import (
     preferred,
     present,
 )
-from dvo.ba.options import BAOptions, damping_at
+from dvo.ba.options import damping_at
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.window import Window
 from dvo.models.step import Revision
@@ -117,7 +117,7 @@ def initialise(patch_window: PatchWindow, config: TrackerConfig, waited: int, be
     window = patch_window.window
     measured = measured_share(window.measured) >= MEASURED_SHARE
     for age in range(config.initial_updates):
-        patch_window.step(BAOptions(fixed=1, damping=damping_at(age)))
+        patch_window.step(1, damping_at(age))
         if age == config.initial_updates // 2 and not measured:
             _solve_again(patch_window, beside)
             match_window(window)

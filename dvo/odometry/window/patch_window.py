@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
-from dvo.ba.options import COLD_UPDATES, BAOptions, damping_at
+from dvo.ba.options import BADamping, BAOptions
 from dvo.map.edges import PatchGraph
 from dvo.map.measurements import depth_factors
 from dvo.map.window import Keyframe, Window, WindowSnapshot
@@ -302,7 +302,7 @@ class PatchWindow:
         """
         fixed = self.window.fixed(optimised)
         for _ in range(count):
-            self.step(BAOptions(fixed=fixed, damping=damping_at(COLD_UPDATES)))
+            self.step(fixed)
 
     def snapshot(self) -> Snapshot:
         """Record everything that steps and one new frame change, for :meth:`restore`."""
@@ -358,17 +358,27 @@ class PatchWindow:
         window.targets, window.weights = revision.targets[0], revision.weights[0]
         window.confidence = revision.weights[0]
 
-    def step(self, options: BAOptions) -> None:
+    def step(
+        self,
+        fixed: int,
+        damping: BADamping = BADamping(),  # noqa: B008 (frozen)
+        structure_only: bool = False,
+    ) -> None:
         """Take a step and store its result in the window, see :func:`dvo.models.step.step`.
 
+        Measured depths and the sensors of the window give further factors.
+
         Args:
-            options: of bundle adjustment; ``bounds`` are replaced by those of the feature map, and ``kernel`` by that
-                of the settings. Measured depths and the sensors of the window give further factors.
+            fixed: number of leading poses that stay.
+            damping: of bundle adjustment.
+            structure_only: all poses stay.
         """
         factors = *depth_factors(self.window.measured), *depth_factors(self.window.prior)
         factors += tuple(factor for sensor in self.sensors for factor in sensor.factors(self.window))
         blocks = {name: block for sensor in self.sensors for name, block in sensor.blocks(self.window).items()}
-        options = replace(options, bounds=self.bounds, kernel=self.settings.kernel)
+        options = BAOptions(
+            fixed=fixed, damping=damping, structure_only=structure_only, bounds=self.bounds, kernel=self.settings.kernel
+        )
         after = step(self.model, self.state(), self.correlation, options, factors=factors, blocks=blocks)
         assert after.targets is not None and after.confidence is not None
         window = self.window

@@ -7,7 +7,7 @@ from dvo.geometry import se3
 from dvo.map.window import Keyframe, Window
 from dvo.nets.patch.patchifier import patch_coordinates
 from dvo.odometry.patch.initial_pose import predict_pose
-from dvo.odometry.window.motion import flow_magnitude, parallax
+from dvo.odometry.window.pose_validation import flow_magnitude, parallax
 
 
 def window(count=4, m=2):

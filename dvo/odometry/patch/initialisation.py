@@ -21,9 +21,8 @@ from dvo.odometry.depth.depth_factor import MEASURED_SHARE, match_window, measur
 from dvo.odometry.frames.content import NO_MATCH
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.uncertainty.uncertainty import has_second_solution
-from dvo.odometry.window.motion import parallax
 from dvo.odometry.window.patch_window import PatchWindow
-from dvo.odometry.window.pose_validation import last_unrelated, measured
+from dvo.odometry.window.pose_validation import last_unrelated, measured, parallax
 
 MOVED_SHARE = 0.2
 """Share of the patches that have to move: the others may be far away, or fixed to the camera."""

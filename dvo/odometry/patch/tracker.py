@@ -51,9 +51,8 @@ from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import result_of
 from dvo.odometry.uncertainty.uncertainty import LaterUncertainty, WindowMeasurements
 from dvo.odometry.window.frame_alignment import FrameAlignment
-from dvo.odometry.window.motion import flow_magnitude
 from dvo.odometry.window.patch_window import PatchWindow
-from dvo.odometry.window.pose_validation import newest_support
+from dvo.odometry.window.pose_validation import flow_magnitude, support_of
 from dvo.odometry.window.sensors import WINDOW_SENSORS, WindowSensor
 
 LOOK_EVERY = 3
@@ -377,7 +376,8 @@ class PatchOdometry:
         if len(window) >= config.initial_frames:
             beside = self.loops.maintenance.helper
             enough = initialise_related(self.graph, self.patch_window, config, state.waited, beside)
-            if enough and newest_support(window).reaches(config.lost_confidence, config.min_inliers):
+            support = support_of(window, len(window) - 1)
+            if enough and support.reaches(config.lost_confidence, config.min_inliers):
                 state.initialise(self.graph.segment)
                 if config.restart:
                     state.ambiguous = measured_share(window.measured) < MEASURED_SHARE  # until it is tried

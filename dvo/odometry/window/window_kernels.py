@@ -1,6 +1,5 @@
 """Kernels of what is asked of a window after a step, and of the pose of a frame that is aligned with it:
-:mod:`dvo.odometry.window.pose_validation`, :mod:`dvo.odometry.window.motion` and
-:mod:`dvo.odometry.window.frame_alignment` are their twins.
+:mod:`dvo.odometry.window.pose_validation` and :mod:`dvo.odometry.window.frame_alignment` are their twins.
 
 Values of a window are float32, what is computed of them float64.
 """

@@ -14,8 +14,7 @@ from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.map.window import Keyframe, Window
 from dvo.odometry.window import pose_validation
-from dvo.odometry.window.motion import flow_magnitude
-from dvo.odometry.window.pose_validation import support_of
+from dvo.odometry.window.pose_validation import flow_magnitude, support_of
 
 M, N = 6, 4
 

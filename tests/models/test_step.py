@@ -57,7 +57,7 @@ def as_window(model, clip, generator):
             i, Keyframe(i, 0.1 * i, slot, *cut), features.matching[:, i : i + 1], se3.identity(), patches[part]
         )
     graph = training_schedule(FRAMES, PATCHES, 1, self_edges=False)[0].graph
-    found.connect_edges(graph.kk, graph.jj)
+    found.window.connect(graph.kk, graph.jj)
     assert found.bounds == (w, h)
     return window, found
 

@@ -207,7 +207,7 @@ def _pair(
         keyframe = Keyframe(slot, float(slot), slot, seen.matching, seen.context, seen.colors, focal, picture)
         pair.insert(slot, keyframe, maps[slot], at, patches)
     kk = torch.arange(pair.window.per_frame, device=device)
-    pair.connect_edges(kk, torch.ones_like(kk))
+    pair.window.connect(kk, torch.ones_like(kk))
     return pair
 
 

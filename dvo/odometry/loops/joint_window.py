@@ -132,7 +132,7 @@ class GroupMatcher:
         pairs = [(i, j) for i, j in product(range(n), range(n)) if max(i, j) >= len(old)]
         kk = torch.cat([torch.arange(i * m, (i + 1) * m, device=device) for i, _ in pairs])
         jj = torch.tensor([j for _, j in pairs], device=device).repeat_interleave(m)
-        joint.connect_edges(kk, jj)
+        joint.window.connect(kk, jj)
         return joint
 
     def _append(self, joint: PatchWindow, slot: int, frame: ArchivedKeyframe, pose_cw: Tensor) -> None:

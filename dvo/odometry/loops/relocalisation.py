@@ -158,7 +158,7 @@ def hold_to_map(graph: KeyframeGraph, patch_window: PatchWindow, finder: LoopFin
     guests = [_guest(finder, graph.archive[k], pose) for k, pose in zip(missing, poses_cw, strict=True)]
     invite(patch_window, [guest for guest in guests if guest is not None])
     if window.guests > before:
-        patch_window.connect_edges(*_edges(window, range(before, window.guests)))
+        patch_window.window.connect(*_edges(window, range(before, window.guests)))
 
 
 def _edges(window: Window, guests: range) -> tuple[Tensor, Tensor]:

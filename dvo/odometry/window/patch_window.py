@@ -253,14 +253,6 @@ class PatchWindow:
         """
         self.window.connect_frame(position, lifetime, self.model.config.self_edges)
 
-    def connect_edges(self, kk: Tensor, jj: Tensor) -> None:
-        """Add edges.
-
-        Args:
-            kk, jj: ``(e,)`` patch and target frame of each new edge.
-        """
-        self.window.connect(kk, jj)
-
     def try_insert(
         self, view: View, position: int, identifier: int, pose_cw: Tensor, depth: Tensor, policy: InsertPolicy
     ) -> Attempt:

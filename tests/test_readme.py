@@ -35,16 +35,14 @@ def test_python_block_runs(image_folder, monkeypatch):
 
 
 def test_live_python_block_runs():
-    """On images of noise in place of a camera: both loops must end, and tell of each frame that was not dropped."""
+    """On images of noise in place of a camera: it must end, and tell of each frame."""
     block = blocks("python")[1]
-    assert len(block.splitlines()) <= 14
+    assert len(block.splitlines()) <= 7
     images = np.random.default_rng(0).integers(0, 255, (6, 480, 640, 3), dtype=np.uint8)
-    passes = []
     said = io.StringIO()
     with contextlib.redirect_stdout(said):
-        exec(compile(block, str(README), "exec"), {"grab": lambda: passes.append(len(said.getvalue())) or iter(images)})
-    first, second = said.getvalue()[: passes[1]].splitlines(), said.getvalue()[passes[1] :].splitlines()
-    assert len(first) == 6 and 1 <= len(second) <= 6
+        exec(compile(block, str(README), "exec"), {"grab": lambda: iter(images)})
+    assert len(said.getvalue().splitlines()) == 6
 
 
 def test_bundle_adjustment_block_runs():

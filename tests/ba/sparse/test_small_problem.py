@@ -14,7 +14,7 @@ from dvo.ba.sparse.levenberg import LMOptions
 from dvo.ba.sparse.small_problem import MOST_FRAMES, is_small
 from dvo.core.errors import DvoError
 from dvo.core.kernels import available
-from tests.ba.sparse.test_global_edges import KERNELS, both, graph
+from tests.support.random_edges import KERNELS, both, graph
 
 
 def apart(problem):

@@ -184,7 +184,8 @@ def _advanced(tensors: Sequence[Tensor], constants: tuple[Any, ...], iterations:
 
     poses, inverse_depths, *measured = (x.detach().contiguous().numpy() for x in tensors)
     poses, inverse_depths = poses.copy(), inverse_depths.copy()
-    take_steps(poses, inverse_depths, *measured, *constants, int(iterations))
+    arguments: tuple[Any, ...] = (*measured, *constants, int(iterations))
+    take_steps(poses, inverse_depths, *arguments)
     return torch.from_numpy(poses), torch.from_numpy(inverse_depths)
 
 

@@ -156,8 +156,8 @@ def adjust_sparse(problem: PatchProblem, options: GlobalBAOptions) -> GlobalBARe
         system: Any  # whose state is of one type or the other
         if options.move_poses and options.solver.solver in ("auto", "direct") and is_small(problem):
             slots = free_slots(options.fixed, len(problem.poses_cw), problem.poses_cw.device)
-            how = options.kernel, options.max_residual, options.depth_range
-            system = SmallProblem(problem, *slots, options.move_depths, *how)
+            how: tuple[Any, ...] = (options.move_depths, options.kernel, options.max_residual, options.depth_range)
+            system = SmallProblem(problem, *slots, *how)
         else:
             system = SparseProblem(problem, options)
         outcome = levenberg_marquardt(system.state, system.linearise, system.cost, system.moved, options.solver)

@@ -96,9 +96,9 @@ class SmallProblem:
         from dvo.ba.layer.edgewise_kernels import frame_pairs
 
         measured = problem.centres, problem.intrinsics, problem.targets, problem.weights
-        edges = [x.contiguous().numpy() for x in (problem.ii, problem.jj, problem.kk)]
-        _, pairs, ends = frame_pairs(*edges, len(problem.poses_cw), len(problem.patches))
-        self.edges = *(x.contiguous().numpy() for x in measured), *edges, pairs, ends
+        ii, jj, kk = (x.contiguous().numpy() for x in (problem.ii, problem.jj, problem.kk))
+        _, pairs, ends = frame_pairs(ii, jj, kk, len(problem.poses_cw), len(problem.patches))
+        self.edges: tuple[Any, ...] = *(x.contiguous().numpy() for x in measured), ii, jj, kk, pairs, ends
         poses, depths = (x.contiguous().numpy().copy() for x in (problem.poses_cw, problem.inverse_depths))
         self.state: Values = poses, depths
         place = slot.numpy()
@@ -112,7 +112,8 @@ class SmallProblem:
         """Half the sum of robust squared residuals; ``counted`` is filled with the edges that count."""
         from dvo.ba.layer.edgewise_kernels import robust_cost
 
-        return float(robust_cost(*state, *self.edges, self.gate, self.robust, self.counted))
+        arguments: tuple[Any, ...] = (*state, *self.edges, self.gate, self.robust, self.counted)
+        return float(robust_cost(*arguments))
 
     def linearise(self, state: Values) -> SmallSystem:
         """Normal equations at a state."""
@@ -120,7 +121,8 @@ class SmallProblem:
 
         size, count = 6 * self.free, len(state[1])
         sums = np.zeros((size, size)), np.zeros((count, size)), np.zeros(count), np.zeros(size), np.zeros(count)
-        add_reprojection(*state, *self.edges, self.rows, self.move_depths, self.gate, self.robust, *sums)
+        edges: tuple[Any, ...] = (*self.edges, self.rows, self.move_depths, self.gate, self.robust)
+        add_reprojection(*state, *edges, *sums)
         return SmallSystem(*sums)
 
     def moved(self, state: Values, step: Values) -> Values:

@@ -121,8 +121,9 @@ class SmallProblem:
 
         size, count = 6 * self.free, len(state[1])
         sums = np.zeros((size, size)), np.zeros((count, size)), np.zeros(count), np.zeros(size), np.zeros(count)
-        edges: tuple[Any, ...] = (*self.edges, self.rows, self.move_depths, self.gate, self.robust)
-        add_reprojection(*state, *edges, *sums)
+        given = *state, *self.edges, self.rows, self.move_depths, self.gate, self.robust
+        arguments: tuple[Any, ...] = (*given, *sums)
+        add_reprojection(*arguments)
         return SmallSystem(*sums)
 
     def moved(self, state: Values, step: Values) -> Values:

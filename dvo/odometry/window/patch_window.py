@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dvo.ba.kernels import Kernel
 from dvo.ba.options import BADamping, BAOptions
+from dvo.ba.problem import Factor
 from dvo.map.edges import PatchGraph
 from dvo.map.measurements import depth_factors
 from dvo.map.window import Keyframe, Window, WindowSnapshot
@@ -365,13 +366,13 @@ class PatchWindow:
             damping: of bundle adjustment.
             structure_only: all poses stay.
         """
-        factors = *depth_factors(self.window.measured), *depth_factors(self.window.prior)
-        factors += tuple(factor for sensor in self.sensors for factor in sensor.factors(self.window))
+        factors: list[Factor] = [*depth_factors(self.window.measured), *depth_factors(self.window.prior)]
+        factors += [factor for sensor in self.sensors for factor in sensor.factors(self.window)]
         blocks = {name: block for sensor in self.sensors for name, block in sensor.blocks(self.window).items()}
         options = BAOptions(
             fixed=fixed, damping=damping, structure_only=structure_only, bounds=self.bounds, kernel=self.settings.kernel
         )
-        after = step(self.model, self.state(), self.correlation, options, factors=factors, blocks=blocks)
+        after = step(self.model, self.state(), self.correlation, options, factors=tuple(factors), blocks=blocks)
         assert after.targets is not None and after.confidence is not None
         window = self.window
         window.poses_cw, window.patches, window.hidden = after.poses_cw[0], after.patches[0], after.hidden[0]

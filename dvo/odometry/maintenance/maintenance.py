@@ -30,7 +30,7 @@ class Job(Generic[T]):
         kind: of the work.
         task: gives its result: beside tracking, or in steps, some of which each frame takes.
         apply: called once with the result, between two frames.
-        left: frames until the result is taken; a job in steps ends with the last of them.
+        left: frames that the network measures until the result is taken; a job in steps ends with the last of them.
     """
 
     kind: Kind

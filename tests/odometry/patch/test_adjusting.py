@@ -38,22 +38,24 @@ def test_a_world_is_adjusted_after_a_loop(film, tmp_path):
     trajectories = []
     for saves in (True, False):
         odometry, count = adjusting(film, lambda loops: kind(loops) == "correction")
-        begun, errors = 0, []
+        begun, waited, applied, errors = 0, 0, 0, []
         for number in range(count, count + 16):
             before, made = odometry.current().trajectory, list(odometry.loops.adjuster.records)
             odometry.track(film[0][number])
+            waited += bool(begun and odometry.aligner.age == 0)  # a frame that was aligned alone takes no part
             if kind(odometry.loops) == "adjustment" and not begun:
                 begun = number
             elif begun and number == begun + 3 and saves:
                 odometry.save(tmp_path / "adjusting.dvo")
             if odometry.loops.adjuster.records != made:
-                assert number == begun + 9
+                assert waited == 9
+                applied = number
                 errors = [evaluate(rows, film[1]).ate_percent for rows in (before, odometry.current().trajectory)]
         assert errors[1] < errors[0]
         (record,) = odometry.loops.adjuster.records
         assert record.cause == "loop" and record.accepted and record.cost < record.cost_before
         assert record.keyframes > 20
-        assert (record.begun, record.applied) == (film[0][begun].timestamp, film[0][begun + 9].timestamp)
+        assert (record.begun, record.applied) == (film[0][begun].timestamp, film[0][applied].timestamp)
         trajectories.append(odometry.current().trajectory.poses_wc)
         odometry.save(tmp_path / "adjusted.dvo")
         told = dvo.load_map(tmp_path / "adjusted.dvo").finish().info["adjustments"]

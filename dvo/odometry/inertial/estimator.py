@@ -227,8 +227,8 @@ class InertialEstimator:
         self._next = time + (EVERY if self.aligned else EVERY / 2)
         if self.solution is not None:  # the window begins with a node that is known
             known = np.isin(np.round(nodes.times, 6), np.round(self.solution.times, 6))
-            nodes = nodes.where(np.arange(len(nodes)) >= int(known.argmax()))
-        problem, doubt = self._problem(nodes)
+            nodes, worlds = _chosen(nodes, worlds, np.arange(len(nodes)) >= int(known.argmax()))
+        problem, worlds, doubt = self._problem(nodes, worlds)
         if problem is None:
             self._refuse(doubt, time)
             return
@@ -271,34 +271,36 @@ class InertialEstimator:
             found.append(state)
         return found
 
-    def corrected(self, present: int, target: int, change: Similarity, time: float) -> None:
-        """Follow a correction of the visual poses by loops.
+    def corrected(self, world: int, target: int, change: Similarity, time: float) -> None:
+        """Follow a correction of the visual poses.
 
-        The newest poses keep their place in the metric world, at once and in the next estimates: their heading and
-        position are held where the last keyframe was corrected, not at the oldest node, whose way to them has changed.
+        The newest poses of the world keep their place in the metric one, at once and in the next estimates: heading and
+        position are held no earlier than at the last keyframe that was corrected, as the way to it has changed.
 
         Args:
-            present: number of the world that the newest visual poses were in.
+            world: number of the world that the poses were in.
             target: of that they are in now.
             change: from that world before to the one after.
-            time: of the last keyframe that was corrected, seconds.
+            time: of the last keyframe of that world, seconds.
         """
-        known, s = self._known_similarity(present), self.solution
+        known, s = self._known_similarity(world), self.solution
         if known is None or s is None:
             return
-        found = known.before(change)
-        self.worlds.pop(present, None)
-        self.worlds[target] = found
-        if present in self._known:
-            k = len(self._known) - 1 - self._known[::-1].index(present)
-            w = s.worlds
-            logs, rotations, translations = w.log_scale.copy(), w.rotation.copy(), w.translation.copy()
+        self.worlds.pop(world, None)
+        self.worlds[target] = known.before(change)
+        if world not in self._known:
+            return
+        w = s.worlds
+        mine = np.flatnonzero(np.array(self._known) == world)
+        logs, rotations, translations = w.log_scale.copy(), w.rotation.copy(), w.translation.copy()
+        for k in mine:
+            found = Similarity(float(np.exp(logs[k])), rotations[k], translations[k]).before(change)
             logs[k], rotations[k], translations[k] = np.log(found.scale), found.rotation, found.translation
-            # The estimate begins with the scales of the last one.
-            scales = s.log_scale - np.log(change.scale)
-            self.solution = replace(s, log_scale=scales, worlds=Similarities(logs, rotations, translations))
             self._known[k] = target
-        self._held = time
+        # The estimate begins with the scales of the last one.
+        scales = np.where(np.isin(s.segment, mine), s.log_scale - np.log(change.scale), s.log_scale)
+        self.solution = replace(s, log_scale=scales, worlds=Similarities(logs, rotations, translations))
+        self._held = max(self._held, time)
 
     def last_state(self) -> BodyState | None:
         """State of the newest node of the solution; None without one."""
@@ -450,7 +452,10 @@ class InertialEstimator:
         Returns:
             The estimate; None where there is none that passes the tests, and what was known before stays.
         """
-        problem, _ = self._problem(nodes)
+        if any(world in self.worlds for world in worlds):  # what was lost before the alignment keeps its own world
+            first = next(k for k, world in enumerate(worlds) if world in self.worlds)
+            nodes, worlds = _chosen(nodes, worlds, nodes.segment >= first)
+        problem, worlds, _ = self._problem(nodes, worlds)
         if problem is None:
             return None
         if self.solution is None:
@@ -482,28 +487,28 @@ class InertialEstimator:
 
     # ------------------------------------------------------------------------------------------------------------------
 
-    def _problem(self, nodes: VisualNodes) -> tuple[Smoother | None, str]:
-        """Problem of nodes that samples cover; None and why there is none."""
+    def _problem(self, nodes: VisualNodes, worlds: list[int]) -> tuple[Smoother | None, list[int], str]:
+        """Problem of nodes that samples cover, and the worlds of its segments; None and why there is none."""
         samples, turn = self.stream.samples(), self.rotation_camera_imu
         if samples is None or len(samples) < 2:
-            return None, "too few samples"
+            return None, worlds, "too few samples"
         if turn is None:
             reason = self._turn_between(nodes, samples)
             turn = self.rotation_camera_imu
             if turn is None:
-                return None, reason
+                return None, worlds, reason
         offset = self.first_offset if self.solution is None else self.solution.time_offset
         lead = 0.03 + abs(offset)
         kept = (nodes.times + lead <= samples.timestamps[-1] + 0.03) & (nodes.times - lead >= samples.timestamps[0])
         if not kept.all():
-            nodes = nodes.where(kept)
+            nodes, worlds = _chosen(nodes, worlds, kept)
         enough = self.options.first if not self.aligned else 2 * self.options.interval
         if len(nodes) < 3 or nodes.times[-1] - nodes.times[0] < enough:
-            return None, "too few poses"
+            return None, worlds, "too few poses"
         near = samples.between(nodes.times[0] - 0.5, nodes.times[-1] + 0.5)
         force = float(np.median(np.linalg.norm(near.accel, axis=1))) if len(near) else 0.0
         if not GRAVITY_RANGE[0] <= force <= GRAVITY_RANGE[1]:
-            return None, f"the median specific force is {force:.3g} m/s^2 where gravity is 9.81: units, or axes"
+            return None, worlds, f"the median specific force is {force:.3g} m/s^2 where gravity is 9.81: units, or axes"
         lever = -turn.T @ self.translation_camera_imu
         problem = Smoother(nodes, near, self.noise, turn, lever, self._smoother, offset=offset)
         if self.solution is None:
@@ -512,7 +517,7 @@ class InertialEstimator:
             at = int(np.abs(self.solution.times - nodes.times[0]).argmin())
             problem.held = self._common(nodes)
             problem.gyro_bias, problem.accel_bias = self.solution.gyro_bias[at], self.solution.accel_bias[at]
-        return problem, ""
+        return problem, worlds, ""
 
     def _turn_between(self, nodes: VisualNodes, samples: InertialSamples) -> str:
         """Find the rotation between sensor and camera; why it is not found."""
@@ -748,6 +753,12 @@ class InertialEstimator:
         for k, world in enumerate(self._known):
             w = found.worlds
             self.worlds[world] = Similarity(float(np.exp(w.log_scale[k])), w.rotation[k], w.translation[k])
+
+
+def _chosen(nodes: VisualNodes, worlds: list[int], keep: Array) -> tuple[VisualNodes, list[int]]:
+    """Nodes that are chosen by a mask ``(N,)``, and the worlds of their segments."""
+    nodes, left = nodes.where(keep)
+    return nodes, [worlds[k] for k in left]
 
 
 def _newest(found: Smoothed, covariance: Array) -> BodyState:

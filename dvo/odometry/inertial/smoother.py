@@ -14,7 +14,7 @@ the camera turns. How noisy a visual trajectory is, its residuals tell (:attr:`S
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -65,17 +65,15 @@ class VisualNodes:
     def __len__(self) -> int:
         return len(self.times)
 
-    def where(self, keep: Array) -> VisualNodes:
-        """Nodes that are chosen by a mask ``(N,)``."""
-        return replace(
-            self, times=self.times[keep], segment=self.segment[keep], rotation=self.rotation[keep],
-            position=self.position[keep],
-        )  # fmt: skip
+    def where(self, keep: Array) -> tuple[VisualNodes, Array]:
+        """Nodes that are chosen by a mask ``(N,)``, and the numbers so far of the segments that are left."""
+        left, segment = np.unique(self.segment[keep], return_inverse=True)
+        nodes = VisualNodes(self.times[keep], segment, self.rotation[keep], self.position[keep], self.depth[left])
+        return nodes, left
 
     def of(self, segment: int) -> VisualNodes:
         """Nodes of one segment, which becomes the only one."""
-        chosen = self.where(self.segment == segment)
-        return replace(chosen, segment=np.zeros(len(chosen), int), depth=self.depth[segment : segment + 1])
+        return self.where(self.segment == segment)[0]
 
 
 @dataclass(frozen=True)
@@ -144,6 +142,7 @@ class Smoothed:
 
     Attributes:
         times: ``(N,)`` of the nodes, clock of the camera.
+        segment: ``(N,)`` of the nodes.
         rotation: ``(N, 3, 3)`` body to world.
         position, velocity: ``(N, 3)`` of the body, metres and m/s.
         gyro_bias, accel_bias: ``(N, 3)``.
@@ -162,6 +161,7 @@ class Smoothed:
     """
 
     times: Array
+    segment: Array
     rotation: Array
     position: Array
     velocity: Array
@@ -393,9 +393,10 @@ def smooth(problem: Smoother, start: Values) -> Smoothed:
             break
     solved, scales = solve_chain(system, pairs=True), values.scales(problem.nodes.segment)
     return Smoothed(
-        problem.nodes.times, values.rotation, values.position, values.velocity, values.bias[:, :3], values.bias[:, 3:],
-        scales, _worlds(problem, values), values.offset, problem.rotation_camera_imu @ so3_exp(values.extrinsic),
-        problem.lever, float(np.exp(scales[-1]) * problem.nodes.depth[-1]), solved.covariance, cost, error,
+        problem.nodes.times, problem.nodes.segment, values.rotation, values.position, values.velocity,
+        values.bias[:, :3], values.bias[:, 3:], scales, _worlds(problem, values), values.offset,
+        problem.rotation_camera_imu @ so3_exp(values.extrinsic), problem.lever,
+        float(np.exp(scales[-1]) * problem.nodes.depth[-1]), solved.covariance, cost, error,
         _visual_error(problem, values, solved),
     )  # fmt: skip
 

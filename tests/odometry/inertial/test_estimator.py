@@ -315,6 +315,18 @@ def test_a_new_segment_after_the_dark_is_joined_and_withdraws_nothing() -> None:
     assert (estimator.worlds[4].rotation @ OTHER.rotation @ recording.turn)[2, 2] > np.cos(np.deg2rad(0.3))
 
 
+def test_a_segment_before_the_one_that_is_aligned_takes_no_part() -> None:
+    recording = record(11, seconds=14.0)
+    estimator = InertialEstimator(InertialOptions())
+    estimator.add(recording.samples)
+    for time in np.arange(2.5, 9.0, 0.5):
+        estimator.update(parts(recording, [(0.1, 1.5), (1.8, time)], [SAME, OTHER]), [0, 1])
+    assert estimator.aligned and set(estimator.worlds) == {1}
+    assert estimator.worlds[1].scale == pytest.approx(SCALE / OTHER.scale, rel=0.05)
+    found = estimator.settle(parts(recording, [(0.1, 1.5), (1.8, 9.0)], [SAME, OTHER]), [0, 1])
+    assert found is not None and estimator.worlds[1].scale == pytest.approx(SCALE / OTHER.scale, rel=0.02)
+
+
 def test_a_world_that_comes_again_has_the_similarity_of_its_newest_part() -> None:
     recording = record(11, seconds=14.0)
     estimator, _ = drive(recording, until=7.0)
@@ -329,6 +341,19 @@ def test_a_world_that_comes_again_has_the_similarity_of_its_newest_part() -> Non
     assert state is not None
     camera = state.position + state.rotation @ LEVER
     assert np.linalg.norm(estimator.worlds[0].points(recording.position[last]) - camera) < 0.02
+
+
+def test_an_earlier_world_follows_a_correction_of_its_own() -> None:
+    recording = record(11, seconds=14.0)
+    estimator, _ = drive(recording, until=7.0)
+    estimator.add(recording.samples.between(estimator.stream.end, 13.0))
+    estimator.update(parts(recording, [(0.0, 6.0), (6.5, 12.5)], [SAME, OTHER]), [0, 4])
+    before = dict(estimator.worlds)
+    change = Similarity(1.3, so3_exp(np.array([0.02, -0.01, 0.03])), np.array([0.6, -0.4, 0.2]))
+    estimator.corrected(0, 0, change, 5.5)
+    point = recording.position[100]
+    np.testing.assert_allclose(estimator.worlds[0].points(change.points(point)), before[0].points(point), atol=1e-9)
+    assert estimator.worlds[4] == before[4]
 
 
 def test_the_newest_poses_keep_their_place_after_a_loop_and_in_the_estimates_that_follow() -> None:

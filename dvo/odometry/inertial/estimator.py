@@ -38,8 +38,8 @@ from dvo.odometry.inertial.temporal import ImuAlignment, align_imu
 from dvo.odometry.protocol import ScaleState
 
 Array = np.ndarray
-EVERY = 1.0
-"""Seconds from one estimate to the next; half of it before the alignment."""
+EVERY, BETWEEN, AT_FIRST = 1.0, 0.2, 0.5
+"""Seconds from one estimate of the whole window to the next; of those that go on from it; and before the alignment."""
 STARTS = (1.0, 0.4, 2.5)
 """Factors of the scale of the linear solution that the first estimate begins with."""
 REFINED_AFTER = 15.0
@@ -173,8 +173,8 @@ class InertialEstimator:
         self.translation_camera_imu: Array = np.zeros(3)
         self.first_offset = 0.0  # time offset that the first estimate begins with, seconds
         self._candidate: tuple[float, float] | None = None  # log scale and its deviation, of an estimate that passed
-        self._failures, self._patience = 0, EVERY / 2
-        self._next = -np.inf
+        self._failures, self._patience = 0, AT_FIRST
+        self._next = self._whole = -np.inf  # times of the next estimate, and of the last one of the whole window
         self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
         self._past: list[BodyState] = []  # states that were newest
         self._held = np.nan  # time of the node whose heading and position are held
@@ -223,8 +223,8 @@ class InertialEstimator:
         """
         if not len(nodes):
             return
-        time = float(nodes.times[-1])
-        self._next = time + (EVERY if self.aligned else EVERY / 2)
+        time = self._whole = float(nodes.times[-1])
+        self._next = time + (EVERY if self.aligned else AT_FIRST)
         if self.solution is not None:  # the window begins with a node that is known
             known = np.isin(np.round(nodes.times, 6), np.round(self.solution.times, 6))
             nodes, worlds = _chosen(nodes, worlds, np.arange(len(nodes)) >= int(known.argmax()))
@@ -251,6 +251,50 @@ class InertialEstimator:
             return
         self._held = float(found.times[problem.held])
         self._accept(found, worlds, time)
+
+    def goes_on_from(self, time: float) -> float | None:
+        """Time from which on visual poses are enough for the next estimate (:meth:`go_on`).
+
+        Args:
+            time: of the newest frame, seconds.
+
+        Returns:
+            Seconds; None if the whole window is due.
+        """
+        past = self.solution.past if self.solution is not None and self.aligned else None
+        return None if past is None or time >= self._whole + EVERY - 1e-6 else past.time
+
+    def go_on(self, nodes: VisualNodes, worlds: list[int]) -> bool:
+        """Bring the last estimate to the newest pose: what the poses before the last seconds have told stays.
+
+        Args:
+            nodes: visual poses from the time on that :meth:`goes_on_from` gives.
+            worlds: number of the world of each segment of the nodes.
+
+        Returns:
+            False if these poses do not go on from the estimate, and the whole window is wanted.
+        """
+        s = self.solution
+        past = None if s is None else s.past
+        if s is None or past is None or worlds != self._known[-1:] or abs(nodes.times[0] - past.time) > 1e-6:
+            return False
+        problem, _, _ = self._problem(nodes, worlds)
+        if problem is None or problem.nodes.times[0] != nodes.times[0]:
+            return False
+        count, present = len(self._known), problem.nodes
+        shown = replace(present, segment=present.segment + count - 1, depth=np.full(count, present.depth[0]))
+        options = replace(self._smoother, iterations=1)
+        problem = replace(
+            problem, nodes=shown, past=past, held=-1 if past.holds else problem.held, options=options
+        )  # fmt: skip
+        try:
+            found = smooth(problem, self._start(problem, self._known))
+        except np.linalg.LinAlgError:
+            return False
+        self._next = float(nodes.times[-1]) + BETWEEN
+        if not self._doubt(problem, found):
+            self._follow(_joined(s, found))
+        return True
 
     def predict(self, start: BodyState, times: Array) -> list[BodyState]:
         """States after a known one, from samples alone.
@@ -299,7 +343,8 @@ class InertialEstimator:
             self._known[k] = target
         # The estimate begins with the scales of the last one.
         scales = np.where(np.isin(s.segment, mine), s.log_scale - np.log(change.scale), s.log_scale)
-        self.solution = replace(s, log_scale=scales, worlds=Similarities(logs, rotations, translations))
+        worlds = Similarities(logs, rotations, translations)
+        self.solution = replace(s, log_scale=scales, worlds=worlds, past=None)
         self._held = max(self._held, time)
 
     def last_state(self) -> BodyState | None:
@@ -600,20 +645,19 @@ class InertialEstimator:
     @staticmethod
     def _drifts(problem: Smoother, start: Values, known: Smoothed) -> tuple[Array, Array, Array]:
         """Worlds and scales of the segments at their first nodes, and the drift of the others."""
-        nodes = problem.nodes
+        nodes, past = problem.nodes, problem.past
         body = problem.rotation_camera_imu @ so3_exp(start.extrinsic)
         begins = np.flatnonzero(np.concatenate([[True], nodes.segment[1:] != nodes.segment[:-1]]))
-        first = begins[nodes.segment]
-        world = start.rotation[begins] @ np.swapaxes(nodes.rotation[begins] @ body, -1, -2)
-        drift = np.zeros((len(nodes), 4))
-        drift[:, :3] = rotation_vector(
-            start.rotation @ np.swapaxes(world[nodes.segment] @ nodes.rotation @ body, -1, -2)
-        )
         scales = start.log_scale[nodes.segment]
         inside = (nodes.times >= known.times[0] - 1e-6) & (nodes.times <= known.times[-1] + 1e-6)
         scales[inside] = np.interp(nodes.times[inside], known.times, known.log_scale)
-        drift[:, 3] = scales - scales[first]
-        return world, scales[begins], drift
+        if past is None:
+            world = start.rotation[begins] @ np.swapaxes(nodes.rotation[begins] @ body, -1, -2)
+            logs = scales[begins]
+        else:  # the first nodes are before these
+            world, logs = past.values.world, past.values.log_scale
+        turn = rotation_vector(start.rotation @ np.swapaxes(world[nodes.segment] @ nodes.rotation @ body, -1, -2))
+        return world, logs, np.concatenate([turn, (scales - logs[nodes.segment])[:, None]], 1)
 
     def _common(self, nodes: VisualNodes) -> int:
         """The node that is held: of those that the last solution has, the nearest to the one held there."""
@@ -710,7 +754,7 @@ class InertialEstimator:
             if again and "is uncertain" not in reason:
                 self._patience = min(2 * self._patience, MOST_PATIENCE)
             else:
-                self._patience = EVERY / 2
+                self._patience = AT_FIRST
             self._next = time + self._patience
             self.reason = reason
             return
@@ -745,11 +789,16 @@ class InertialEstimator:
 
     def _take(self, found: Smoothed, worlds: list[int]) -> None:
         """Let poses follow an estimate."""
-        self.solution = found
         self._known = list(worlds[: len(found.worlds.log_scale)])
+        self._follow(found)
         state = self.last_state()
         assert state is not None
         self._past.append(state)
+        if found.past is not None:
+            self._next = float(found.times[-1]) + BETWEEN
+
+    def _follow(self, found: Smoothed) -> None:
+        self.solution = found
         for k, world in enumerate(self._known):
             w = found.worlds
             self.worlds[world] = Similarity(float(np.exp(w.log_scale[k])), w.rotation[k], w.translation[k])
@@ -769,11 +818,19 @@ def _newest(found: Smoothed, covariance: Array) -> BodyState:
     )  # fmt: skip
 
 
+def _joined(before: Smoothed, after: Smoothed) -> Smoothed:
+    """An estimate, and nodes of the one that it goes on from before it."""
+    kept = before.times < after.times[0] - 1e-6
+    names = "times", "segment", "rotation", "position", "velocity", "gyro_bias", "accel_bias", "log_scale"
+    nodes = {name: np.concatenate([getattr(before, name)[kept], getattr(after, name)]) for name in names}
+    return replace(after, **nodes)
+
+
 def _from_first_camera(found: Smoothed) -> Smoothed:
     """An estimate of one segment, whose origin moves to the place of the first camera."""
     origin = found.worlds.translation[-1]
     worlds = replace(found.worlds, translation=found.worlds.translation - origin)
-    return replace(found, position=found.position - origin, worlds=worlds)
+    return replace(found, position=found.position - origin, worlds=worlds, past=None)
 
 
 def _turns(samples: InertialSamples, sensor: ImuAlignment, times: Array, offsets: Array) -> Array:

@@ -21,6 +21,7 @@ from dvo.odometry.inertial.smoother import (
     GRAVITY,
     NODE,
     STATE,
+    Past,
     Similarities,
     Smoothed,
     Smoother,
@@ -206,16 +207,21 @@ class InertialEstimator:
             rotation, translation = split(np.asarray(samples.T_camera_imu, float))
             self.rotation_camera_imu, self.translation_camera_imu = rotation, translation
 
-    def due(self, time: float) -> bool:
-        """Whether an estimate should be made.
+    def refresh(self, time: float, nodes: Callable[[float], tuple[VisualNodes, list[int]]]) -> None:
+        """Make the next estimate if it is due: of the whole window, or one that goes on from it.
 
         Args:
             time: of the newest frame, seconds.
+            nodes: gives the visual poses from a time on, and the world of each of their segments.
         """
-        return self.state is not ScaleState.NONE and time >= self._next
+        if self.state is ScaleState.NONE or time < self._next:
+            return
+        past = self.solution.past if self.solution is not None and self.aligned else None
+        if past is None or time > self._whole + EVERY - 1e-6 or not self._go_on(past, *nodes(past.time)):
+            self.update(*nodes(time - self.options.window))
 
     def update(self, nodes: VisualNodes, worlds: list[int]) -> None:
-        """Make an estimate, and take it if it passes the tests.
+        """Make an estimate of the whole window, and take it if it passes the tests.
 
         Args:
             nodes: visual poses of the last seconds.
@@ -251,50 +257,6 @@ class InertialEstimator:
             return
         self._held = float(found.times[problem.held])
         self._accept(found, worlds, time)
-
-    def goes_on_from(self, time: float) -> float | None:
-        """Time from which on visual poses are enough for the next estimate (:meth:`go_on`).
-
-        Args:
-            time: of the newest frame, seconds.
-
-        Returns:
-            Seconds; None if the whole window is due.
-        """
-        past = self.solution.past if self.solution is not None and self.aligned else None
-        return None if past is None or time >= self._whole + EVERY - 1e-6 else past.time
-
-    def go_on(self, nodes: VisualNodes, worlds: list[int]) -> bool:
-        """Bring the last estimate to the newest pose: what the poses before the last seconds have told stays.
-
-        Args:
-            nodes: visual poses from the time on that :meth:`goes_on_from` gives.
-            worlds: number of the world of each segment of the nodes.
-
-        Returns:
-            False if these poses do not go on from the estimate, and the whole window is wanted.
-        """
-        s = self.solution
-        past = None if s is None else s.past
-        if s is None or past is None or worlds != self._known[-1:] or abs(nodes.times[0] - past.time) > 1e-6:
-            return False
-        problem, _, _ = self._problem(nodes, worlds)
-        if problem is None or problem.nodes.times[0] != nodes.times[0]:
-            return False
-        count, present = len(self._known), problem.nodes
-        shown = replace(present, segment=present.segment + count - 1, depth=np.full(count, present.depth[0]))
-        options = replace(self._smoother, iterations=1)
-        problem = replace(
-            problem, nodes=shown, past=past, held=-1 if past.holds else problem.held, options=options
-        )  # fmt: skip
-        try:
-            found = smooth(problem, self._start(problem, self._known))
-        except np.linalg.LinAlgError:
-            return False
-        self._next = float(nodes.times[-1]) + BETWEEN
-        if not self._doubt(problem, found):
-            self._follow(_joined(s, found))
-        return True
 
     def predict(self, start: BodyState, times: Array) -> list[BodyState]:
         """States after a known one, from samples alone.
@@ -531,6 +493,32 @@ class InertialEstimator:
         return found
 
     # ------------------------------------------------------------------------------------------------------------------
+
+    def _go_on(self, past: Past, nodes: VisualNodes, worlds: list[int]) -> bool:
+        """Bring the last estimate to the newest pose, as what older poses have told stays; False if they do not fit."""
+        known = self.solution
+        if (
+            known is None
+            or worlds != self._known[-1:]
+            or worlds[0] not in self.worlds
+            or abs(nodes.times[0] - past.time) > 1e-6
+        ):
+            return False
+        problem, _, _ = self._problem(nodes, worlds)
+        if problem is None or problem.nodes.times[0] != nodes.times[0]:
+            return False
+        count, present = len(self._known), problem.nodes
+        problem.nodes = replace(present, segment=present.segment + count - 1, depth=np.full(count, present.depth[0]))
+        problem.past, problem.held = past, -1 if past.holds else problem.held
+        problem.options = replace(self._smoother, iterations=1)
+        try:
+            found = smooth(problem, self._start(problem, self._known))
+        except np.linalg.LinAlgError:
+            return False
+        self._next = float(nodes.times[-1]) + BETWEEN
+        if not self._doubt(problem, found):
+            self._follow(_joined(known, found))
+        return True
 
     def _problem(self, nodes: VisualNodes, worlds: list[int]) -> tuple[Smoother | None, list[int], str]:
         """Problem of nodes that samples cover, and the worlds of its segments; None and why there is none."""
@@ -782,7 +770,7 @@ class InertialEstimator:
         new = worlds[-1] not in self.worlds
         if not new or found.scale_sigma <= 2 * self.options.max_scale_sigma:
             self._take(found, worlds)
-        else:  # a new segment, whose scale is not sure yet
+        elif found.scale_sigma < NOTHING_TOLD:  # a new segment, whose scale is not sure yet
             self.solution, self._known = found, list(worlds[: len(found.worlds.log_scale)])
         if time - self._aligned >= REFINED_AFTER:
             self.state = ScaleState.REFINED
@@ -795,7 +783,7 @@ class InertialEstimator:
         assert state is not None
         self._past.append(state)
         if found.past is not None:
-            self._next = float(found.times[-1]) + BETWEEN
+            self._next = self._whole + BETWEEN
 
     def _follow(self, found: Smoothed) -> None:
         self.solution = found

@@ -133,10 +133,10 @@ class InertialTracking:
             self._compare(time, estimate.pose_wc)
             if self.metric:
                 return estimate
-            if estimator.due(time) or self._anchor is not None:
-                since = None if self._anchor is not None else estimator.goes_on_from(time)
-                if since is None or not estimator.go_on(*self._nodes(since)):
-                    estimator.update(*self._nodes(time - self.options.window))
+            if self._anchor is None:
+                estimator.refresh(time, self._nodes)
+            else:
+                estimator.update(*self._nodes(time - self.options.window))
             similarity = self._similarity()
             if similarity is not None:
                 return self._metric(estimate, similarity)

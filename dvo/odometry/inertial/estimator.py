@@ -20,6 +20,7 @@ from dvo.odometry.inertial.preintegration import preintegrate, propagate
 from dvo.odometry.inertial.smoother import (
     GRAVITY,
     NODE,
+    RECENT,
     STATE,
     Past,
     Similarities,
@@ -58,7 +59,8 @@ MAX_ERROR = 6.0
 GRAVITY_RANGE = (6.0, 16.0)
 """Median specific force of a camera that is moved by hand, by a vehicle or in flight, m/s^2."""
 MAX_TURN = 1.5
-"""Root mean square difference of rotations between nodes, degrees, above which gyroscope and images disagree."""
+"""Difference of rotations between nodes, root mean square of all and median of the newest, degrees, above which
+gyroscope and images disagree."""
 FOUND_EXTRINSIC = 0.02
 """Deviation of a rotation between sensor and camera that was found from the motion, rad."""
 NOISE_RANGE = (0.3, 30.0)
@@ -686,8 +688,12 @@ class InertialEstimator:
         turned = nodes.rotation @ problem.rotation_camera_imu
         motion = preintegrate(problem.samples, nodes.times + offset, gyro[:-1], accel[:-1], problem.noise)
         off = rotation_vector(np.swapaxes(motion.rotation, -1, -2) @ np.swapaxes(turned[:-1], -1, -2) @ turned[1:])
-        off = off[motion.covered & (nodes.segment[1:] == nodes.segment[:-1])]
-        angle = float(np.rad2deg(np.sqrt((off**2).sum(-1).mean()))) if len(off) else 0.0
+        inside = motion.covered & (nodes.segment[1:] == nodes.segment[:-1])
+        recent = inside & (nodes.times[:-1] >= nodes.times[-1] - RECENT)
+        squares = (off**2).sum(-1)
+        angle = float(np.rad2deg(np.sqrt(squares[inside].mean()))) if inside.any() else 0.0
+        if recent.any():  # a sensor that has just been hit; images that jump once do not count
+            angle = max(angle, float(np.rad2deg(np.sqrt(np.median(squares[recent])))))
         if angle > MAX_TURN:
             raise _DisagreementError(
                 f"gyroscope and images turn differently, by {angle:.1f} degrees: axes, time offset or clock"

@@ -161,6 +161,23 @@ def test_an_alignment_that_fails_later_is_withdrawn() -> None:
     assert [entry["event"] for entry in estimator.history][:2] == ["aligned", "withdrawn"]
 
 
+@pytest.mark.long
+def test_an_alignment_is_withdrawn_when_the_sensor_falls_before_the_scale_is_wrong() -> None:
+    """Biases of 0.2 rad/s and 2 m/s^2 from one sample to the next."""
+    recording = record(5, seconds=13.0)
+    s = recording.samples
+    after = (s.timestamps > 8.0)[:, None]
+    recording = recording.with_samples(gyro=s.gyro + after * [0.12, 0.16, 0.0], accel=s.accel + after * [0.0, 1.2, 1.6])
+    estimator = InertialEstimator(InertialOptions())
+    for time in recording.times:
+        feed(estimator, recording, time)
+        for world in estimator.worlds.values():
+            assert world.scale == pytest.approx(SCALE, rel=0.1)
+    aligned, withdrawn = estimator.history[:2]
+    assert (aligned["event"], withdrawn["event"]) == ("aligned", "withdrawn")
+    assert 8.0 < withdrawn["time"] < 12.5
+
+
 def _consistency(recording: Recording, window: float) -> np.ndarray:
     """NEES ``(K, 3)`` of position, orientation and velocity of poses as they come, from the one at the alignment on."""
     estimator, rows = InertialEstimator(InertialOptions(window=window)), []

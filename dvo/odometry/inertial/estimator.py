@@ -20,7 +20,6 @@ from dvo.odometry.inertial.preintegration import preintegrate, propagate
 from dvo.odometry.inertial.smoother import (
     GRAVITY,
     NODE,
-    RECENT,
     STATE,
     Past,
     Similarities,
@@ -58,9 +57,9 @@ MAX_ERROR = 6.0
 """Mean squared whitened residual above which samples and images do not fit."""
 GRAVITY_RANGE = (6.0, 16.0)
 """Median specific force of a camera that is moved by hand, by a vehicle or in flight, m/s^2."""
-MAX_TURN = 1.5
-"""Difference of rotations between nodes, root mean square of all and median of the newest, degrees, above which
-gyroscope and images disagree."""
+MAX_TURN, LAST_TURNS = 1.5, 1.0
+"""Difference of rotations between nodes above which gyroscope and images disagree, degrees: root mean square of all,
+and median of the last seconds."""
 FOUND_EXTRINSIC = 0.02
 """Deviation of a rotation between sensor and camera that was found from the motion, rad."""
 NOISE_RANGE = (0.3, 30.0)
@@ -689,7 +688,7 @@ class InertialEstimator:
         motion = preintegrate(problem.samples, nodes.times + offset, gyro[:-1], accel[:-1], problem.noise)
         off = rotation_vector(np.swapaxes(motion.rotation, -1, -2) @ np.swapaxes(turned[:-1], -1, -2) @ turned[1:])
         inside = motion.covered & (nodes.segment[1:] == nodes.segment[:-1])
-        recent = inside & (nodes.times[:-1] >= nodes.times[-1] - RECENT)
+        recent = inside & (nodes.times[:-1] >= nodes.times[-1] - LAST_TURNS)
         squares = (off**2).sum(-1)
         angle = float(np.rad2deg(np.sqrt(squares[inside].mean()))) if inside.any() else 0.0
         if recent.any():  # a sensor that has just been hit; images that jump once do not count

@@ -814,9 +814,16 @@ def _newest(found: Smoothed, covariance: Array) -> BodyState:
 def _joined(before: Smoothed, after: Smoothed) -> Smoothed:
     """An estimate, and nodes of the one that it goes on from before it."""
     kept = before.times < after.times[0] - 1e-6
-    names = "times", "segment", "rotation", "position", "velocity", "gyro_bias", "accel_bias", "log_scale"
-    nodes = {name: np.concatenate([getattr(before, name)[kept], getattr(after, name)]) for name in names}
-    return replace(after, **nodes)
+
+    def joined(early: Array, late: Array) -> Array:
+        return np.concatenate([early[kept], late])
+
+    return replace(
+        after, times=joined(before.times, after.times), segment=joined(before.segment, after.segment),
+        rotation=joined(before.rotation, after.rotation), position=joined(before.position, after.position),
+        velocity=joined(before.velocity, after.velocity), gyro_bias=joined(before.gyro_bias, after.gyro_bias),
+        accel_bias=joined(before.accel_bias, after.accel_bias), log_scale=joined(before.log_scale, after.log_scale),
+    )  # fmt: skip
 
 
 def _from_first_camera(found: Smoothed) -> Smoothed:

@@ -216,8 +216,10 @@ class Values:
 
     def part(self, rows: slice) -> Values:
         """Those of some nodes."""
-        mine = (values[rows] for values in (self.rotation, self.position, self.velocity, self.bias, self.drift))
-        return Values(*mine, self.offset, self.extrinsic, self.log_scale, self.world)
+        return replace(
+            self, rotation=self.rotation[rows], position=self.position[rows], velocity=self.velocity[rows],
+            bias=self.bias[rows], drift=self.drift[rows],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

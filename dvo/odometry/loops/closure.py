@@ -343,5 +343,6 @@ class LoopCloser:
         """
         self.loops[:] = [loop.in_units(moved.units) for loop in self.loops]
         self.pending = None if self.pending is None else self.pending.in_units(moved.units)
-        for carried in moved.worlds if self.follow is not None else ():
-            self.follow(carried)
+        if self.follow is not None:
+            for carried in moved.worlds:
+                self.follow(carried)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,6 +12,39 @@ from torch import Tensor
 from dvo.geometry import se3, sim3
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.map import Map
+
+
+@dataclass(frozen=True)
+class Carried:
+    """How the newest poses of a world have moved, which are those after its last keyframe.
+
+    Attributes:
+        world: its number before; :meth:`Map.world_of` tells the one that it belongs to after.
+        change: ``(8,)`` similarity from that world before to the one after.
+        time: of the last keyframe, seconds.
+        window: the window has moved along, as it is in this world.
+    """
+
+    world: int
+    change: Tensor
+    time: float
+    window: bool
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What a correction has moved.
+
+    Attributes:
+        units: new unit of each keyframe, in old ones: the scale of its similarity.
+        worlds: the newest poses of each world, that of the window last.
+    """
+
+    units: Mapping[int, float]
+    worlds: tuple[Carried, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.units)
 
 
 def apply_similarities(graph: Map, identifiers: np.ndarray, similarities: Tensor) -> None:
@@ -102,6 +138,35 @@ def move_window(graph: KeyframeGraph, before_cw: Tensor, similarity: Tensor) -> 
     patches[:, 2] *= scale
     window.patches = patches
     _rescale_relative(graph, {frame.identifier: scale for frame in window.frames if not frame.guest})
+
+
+def carry(
+    graph: KeyframeGraph, identifiers: np.ndarray, before_cw: Tensor, similarities: Tensor
+) -> tuple[Carried, ...]:
+    """Move the window along with keyframes that have moved, if it is in one of their worlds.
+
+    Args:
+        graph: its window is changed.
+        identifiers: ``(N,)`` increasing.
+        before_cw: ``(N, 7)`` float64 poses of the keyframes before.
+        similarities: ``(N, 8)`` of the keyframes now, see :func:`apply_similarities`.
+
+    Returns:
+        How the newest poses of the worlds have moved, see :attr:`Moved.worlds`.
+    """
+    last = {graph.world_of(graph.segment_of(k)): row for row, k in enumerate(identifiers.tolist())}
+    carriers, present, carrier = dict(last), graph.world_of(graph.segment), window_carrier(graph, identifiers)
+    carriers.pop(present, None)
+    if carrier is not None:
+        move_window(graph, before_cw[carrier], similarities[carrier])
+        carriers[present] = carrier
+    return tuple(
+        Carried(
+            world, sim3.compose(sim3.inverse(similarities[row]), sim3.from_se3(before_cw[row])),
+            graph.archive[int(identifiers[last.get(world, row)])].timestamp, world == present,
+        )
+        for world, row in carriers.items()
+    )  # fmt: skip
 
 
 def window_carrier(graph: KeyframeGraph, identifiers: np.ndarray) -> int | None:

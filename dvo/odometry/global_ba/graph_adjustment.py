@@ -22,7 +22,7 @@ from torch import Tensor
 
 from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3, sim3
-from dvo.map.correction import apply_similarities, move_window, window_carrier
+from dvo.map.correction import Moved, apply_similarities, carry
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.map import Map
 from dvo.map.recordings import increasing_times
@@ -208,7 +208,7 @@ def prepare(
     return Adjustment(Snapshot.of(graph), world, options, shutter, limits.frames, limits.edges)
 
 
-def apply(graph: KeyframeGraph, world: int, adjusted: Adjusted) -> dict[int, float]:
+def apply(graph: KeyframeGraph, world: int, adjusted: Adjusted) -> Moved:
     """Correct the keyframes of a world by a solution, and the window if it is in this world.
 
     Args:
@@ -217,14 +217,14 @@ def apply(graph: KeyframeGraph, world: int, adjusted: Adjusted) -> dict[int, flo
         adjusted: the solution.
 
     Returns:
-        New unit of each kept keyframe that has moved, in old ones.
+        What has moved: kept keyframes.
     """
     position = {int(k): row for row, k in enumerate(adjusted.identifiers)}
     anchored = [f.identifier for f in graph.archive if f.anchor is None and graph.segment_of(f.identifier) >= 0]
     kept = [k for k in anchored if graph.world_of(graph.segment_of(k)) == world]
     solved = [k for k in kept if k in position]
     if not solved:
-        return {}
+        return Moved({})
     moving = np.array([k for k in kept if k in position or k > solved[-1]], dtype=np.int64)
     before = graph.poses_cw(moving)
     base_cw, base = before[len(solved) - 1], adjusted.similarities[position[solved[-1]]]
@@ -233,10 +233,8 @@ def apply(graph: KeyframeGraph, world: int, adjusted: Adjusted) -> dict[int, flo
     found = torch.where((own >= 0)[:, None], adjusted.similarities[own], carried)
     apply_similarities(graph, moving, found)
     _set_exactly(graph, adjusted)
-    carrier = window_carrier(graph, moving)
-    if carrier is not None:
-        move_window(graph, before[carrier], found[carrier])
-    return dict(zip(moving.tolist(), found[:, 7].tolist(), strict=True))
+    units = dict(zip(moving.tolist(), found[:, 7].tolist(), strict=True))
+    return Moved(units, carry(graph, moving, before, found))
 
 
 def _set_exactly(graph: Map, adjusted: Adjusted) -> None:

@@ -79,28 +79,11 @@ def solve_chain(system: ChainSystem, damping: float = 0.0, *, pairs: bool = Fals
         numpy.linalg.LinAlgError: it is not positive definite.
     """
     count, n, m = system.border.shape
-    # What couples a state with all that come later: the state after it, the border, and the right side as a column.
-    shared = np.empty((m, m + 1))
-    shared[:, :m], shared[:, m] = system.shared, system.right_shared
-    shared[np.arange(m), np.arange(m)] *= 1 + damping
-    inverses = np.empty((count, n, n))
-    coupled = np.empty((count, n, n + m + 1))
-    block, side = system.diagonal[0].copy(), np.concatenate([system.border[0], system.right[0][:, None]], 1)
-    index = np.arange(n)
-    for k in range(count):
-        block[index, index] += damping * system.diagonal[k][index, index]
-        lower = np.linalg.inv(np.linalg.cholesky(block))
-        inverses[k] = lower
-        last = k == count - 1
-        scaled = lower @ (side if last else np.concatenate([system.upper[k], side], 1))
-        coupled[k, :, : scaled.shape[1]] = scaled
-        if last:
-            shared -= scaled[:, :m].T @ scaled
-            break
-        ahead, rest = scaled[:, :n], scaled[:, n:]
-        shared -= rest[:, :m].T @ rest
-        block = system.diagonal[k + 1] - ahead.T @ ahead
-        side = np.concatenate([system.border[k + 1], system.right[k + 1][:, None]], 1) - ahead.T @ rest
+    inverses, coupled, block, side, shared = _eliminated(system, damping)
+    inverses[-1] = np.linalg.inv(np.linalg.cholesky(block))
+    scaled = inverses[-1] @ side
+    coupled[-1, :, : m + 1] = scaled
+    shared -= scaled[:, :m].T @ scaled
     root = np.linalg.inv(np.linalg.cholesky(shared[:, :m])) if m else np.zeros((0, 0))
     common = root.T @ (root @ shared[:, m])
     states = np.empty((count, n))
@@ -117,6 +100,47 @@ def solve_chain(system: ChainSystem, damping: float = 0.0, *, pairs: bool = Fals
     joint[n:, n:] = root.T
     covariance = joint @ joint.T
     return ChainSolution(states, common, covariance, _pairs(inverses, coupled, covariance) if pairs else None)
+
+
+def marginal(system: ChainSystem) -> tuple[Array, Array]:
+    """Normal equations of the last state and the shared unknowns, without the states before (Schur complement).
+
+    Args:
+        system: positive definite but for the last state and the shared unknowns.
+
+    Returns:
+        Information ``(n + m, n + m)`` and right side ``(n + m,)``.
+
+    Raises:
+        numpy.linalg.LinAlgError: it is not positive definite.
+    """
+    n, m = system.border.shape[1:]
+    block, side, shared = _eliminated(system, 0.0)[2:]
+    information = np.block([[block, side[:, :m]], [side[:, :m].T, shared[:, :m]]])
+    return information, np.concatenate([side[:, m], shared[:, m]])
+
+
+def _eliminated(system: ChainSystem, damping: float) -> tuple[Array, Array, Array, Array, Array]:
+    """All states but the last: inverses of their Cholesky factors, and what couples each with all that come later (the
+    state after it, the border, and the right side as a column); equations of the last one and of the border."""
+    count, n, m = system.border.shape
+    shared = np.empty((m, m + 1))
+    shared[:, :m], shared[:, m] = system.shared, system.right_shared
+    shared[np.arange(m), np.arange(m)] *= 1 + damping
+    inverses = np.empty((count, n, n))
+    coupled = np.empty((count, n, n + m + 1))
+    block, side = system.diagonal[0].copy(), np.concatenate([system.border[0], system.right[0][:, None]], 1)
+    index = np.arange(n)
+    for k in range(count - 1):
+        block[index, index] += damping * system.diagonal[k][index, index]
+        inverses[k] = np.linalg.inv(np.linalg.cholesky(block))
+        coupled[k] = scaled = inverses[k] @ np.concatenate([system.upper[k], side], 1)
+        ahead, rest = scaled[:, :n], scaled[:, n:]
+        shared -= rest[:, :m].T @ rest
+        block = system.diagonal[k + 1] - ahead.T @ ahead
+        side = np.concatenate([system.border[k + 1], system.right[k + 1][:, None]], 1) - ahead.T @ rest
+    block[index, index] += damping * system.diagonal[-1][index, index]
+    return inverses, coupled, block, side, shared
 
 
 def _pairs(inverses: Array, coupled: Array, last: Array) -> Array:

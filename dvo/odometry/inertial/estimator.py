@@ -21,6 +21,7 @@ from dvo.odometry.inertial.smoother import (
     GRAVITY,
     NODE,
     STATE,
+    Past,
     Similarities,
     Smoothed,
     Smoother,
@@ -38,8 +39,8 @@ from dvo.odometry.inertial.temporal import ImuAlignment, align_imu
 from dvo.odometry.protocol import ScaleState
 
 Array = np.ndarray
-EVERY = 1.0
-"""Seconds from one estimate to the next; half of it before the alignment."""
+EVERY, BETWEEN, AT_FIRST = 1.0, 0.2, 0.5
+"""Seconds from one estimate of the whole window to the next; of those that go on from it; and before the alignment."""
 STARTS = (1.0, 0.4, 2.5)
 """Factors of the scale of the linear solution that the first estimate begins with."""
 REFINED_AFTER = 15.0
@@ -56,8 +57,9 @@ MAX_ERROR = 6.0
 """Mean squared whitened residual above which samples and images do not fit."""
 GRAVITY_RANGE = (6.0, 16.0)
 """Median specific force of a camera that is moved by hand, by a vehicle or in flight, m/s^2."""
-MAX_TURN = 1.5
-"""Root mean square difference of rotations between nodes, degrees, above which gyroscope and images disagree."""
+MAX_TURN, LAST_TURNS = 1.5, 1.0
+"""Difference of rotations between nodes above which gyroscope and images disagree, degrees: root mean square of all,
+and median of the last seconds."""
 FOUND_EXTRINSIC = 0.02
 """Deviation of a rotation between sensor and camera that was found from the motion, rad."""
 NOISE_RANGE = (0.3, 30.0)
@@ -173,8 +175,8 @@ class InertialEstimator:
         self.translation_camera_imu: Array = np.zeros(3)
         self.first_offset = 0.0  # time offset that the first estimate begins with, seconds
         self._candidate: tuple[float, float] | None = None  # log scale and its deviation, of an estimate that passed
-        self._failures, self._patience = 0, EVERY / 2
-        self._next = -np.inf
+        self._failures, self._patience = 0, AT_FIRST
+        self._next = self._whole = -np.inf  # times of the next estimate, and of the last one of the whole window
         self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
         self._past: list[BodyState] = []  # states that were newest
         self._held = np.nan  # time of the node whose heading and position are held
@@ -206,16 +208,21 @@ class InertialEstimator:
             rotation, translation = split(np.asarray(samples.T_camera_imu, float))
             self.rotation_camera_imu, self.translation_camera_imu = rotation, translation
 
-    def due(self, time: float) -> bool:
-        """Whether an estimate should be made.
+    def refresh(self, time: float, nodes: Callable[[float], tuple[VisualNodes, list[int]]]) -> None:
+        """Make the next estimate if it is due: of the whole window, or one that goes on from it.
 
         Args:
             time: of the newest frame, seconds.
+            nodes: gives the visual poses from a time on, and the world of each of their segments.
         """
-        return self.state is not ScaleState.NONE and time >= self._next
+        if self.state is ScaleState.NONE or time < self._next:
+            return
+        past = self.solution.past if self.solution is not None and self.aligned else None
+        if past is None or time > self._whole + EVERY - 1e-6 or not self._go_on(past, *nodes(past.time)):
+            self.update(*nodes(time - self.options.window))
 
     def update(self, nodes: VisualNodes, worlds: list[int]) -> None:
-        """Make an estimate, and take it if it passes the tests.
+        """Make an estimate of the whole window, and take it if it passes the tests.
 
         Args:
             nodes: visual poses of the last seconds.
@@ -223,12 +230,12 @@ class InertialEstimator:
         """
         if not len(nodes):
             return
-        time = float(nodes.times[-1])
-        self._next = time + (EVERY if self.aligned else EVERY / 2)
+        time = self._whole = float(nodes.times[-1])
+        self._next = time + (EVERY if self.aligned else AT_FIRST)
         if self.solution is not None:  # the window begins with a node that is known
             known = np.isin(np.round(nodes.times, 6), np.round(self.solution.times, 6))
-            nodes = nodes.where(np.arange(len(nodes)) >= int(known.argmax()))
-        problem, doubt = self._problem(nodes)
+            nodes, worlds = _chosen(nodes, worlds, np.arange(len(nodes)) >= int(known.argmax()))
+        problem, worlds, doubt = self._problem(nodes, worlds)
         if problem is None:
             self._refuse(doubt, time)
             return
@@ -271,34 +278,37 @@ class InertialEstimator:
             found.append(state)
         return found
 
-    def corrected(self, present: int, target: int, change: Similarity, time: float) -> None:
-        """Follow a correction of the visual poses by loops.
+    def corrected(self, world: int, target: int, change: Similarity, time: float) -> None:
+        """Follow a correction of the visual poses.
 
-        The newest poses keep their place in the metric world, at once and in the next estimates: their heading and
-        position are held where the last keyframe was corrected, not at the oldest node, whose way to them has changed.
+        The newest poses of the world keep their place in the metric one, at once and in the next estimates: heading and
+        position are held no earlier than at the last keyframe that was corrected, as the way to it has changed.
 
         Args:
-            present: number of the world that the newest visual poses were in.
+            world: number of the world that the poses were in.
             target: of that they are in now.
             change: from that world before to the one after.
-            time: of the last keyframe that was corrected, seconds.
+            time: of the last keyframe of that world, seconds.
         """
-        known, s = self._known_similarity(present), self.solution
+        known, s = self._known_similarity(world), self.solution
         if known is None or s is None:
             return
-        found = known.before(change)
-        self.worlds.pop(present, None)
-        self.worlds[target] = found
-        if present in self._known:
-            k = len(self._known) - 1 - self._known[::-1].index(present)
-            w = s.worlds
-            logs, rotations, translations = w.log_scale.copy(), w.rotation.copy(), w.translation.copy()
+        self.worlds.pop(world, None)
+        self.worlds[target] = known.before(change)
+        if world not in self._known:
+            return
+        w = s.worlds
+        mine = np.flatnonzero(np.array(self._known) == world)
+        logs, rotations, translations = w.log_scale.copy(), w.rotation.copy(), w.translation.copy()
+        for k in mine:
+            found = Similarity(float(np.exp(logs[k])), rotations[k], translations[k]).before(change)
             logs[k], rotations[k], translations[k] = np.log(found.scale), found.rotation, found.translation
-            # The estimate begins with the scales of the last one.
-            scales = s.log_scale - np.log(change.scale)
-            self.solution = replace(s, log_scale=scales, worlds=Similarities(logs, rotations, translations))
             self._known[k] = target
-        self._held = time
+        # The estimate begins with the scales of the last one.
+        scales = np.where(np.isin(s.segment, mine), s.log_scale - np.log(change.scale), s.log_scale)
+        worlds = Similarities(logs, rotations, translations)
+        self.solution = replace(s, log_scale=scales, worlds=worlds, past=None)
+        self._held = max(self._held, time)
 
     def last_state(self) -> BodyState | None:
         """State of the newest node of the solution; None without one."""
@@ -450,7 +460,10 @@ class InertialEstimator:
         Returns:
             The estimate; None where there is none that passes the tests, and what was known before stays.
         """
-        problem, _ = self._problem(nodes)
+        if any(world in self.worlds for world in worlds):  # what was lost before the alignment keeps its own world
+            first = next(k for k, world in enumerate(worlds) if world in self.worlds)
+            nodes, worlds = _chosen(nodes, worlds, nodes.segment >= first)
+        problem, worlds, _ = self._problem(nodes, worlds)
         if problem is None:
             return None
         if self.solution is None:
@@ -482,28 +495,54 @@ class InertialEstimator:
 
     # ------------------------------------------------------------------------------------------------------------------
 
-    def _problem(self, nodes: VisualNodes) -> tuple[Smoother | None, str]:
-        """Problem of nodes that samples cover; None and why there is none."""
+    def _go_on(self, past: Past, nodes: VisualNodes, worlds: list[int]) -> bool:
+        """Bring the last estimate to the newest pose, as what older poses have told stays; False if they do not fit."""
+        known = self.solution
+        if (
+            known is None
+            or worlds != self._known[-1:]
+            or worlds[0] not in self.worlds
+            or abs(nodes.times[0] - past.time) > 1e-6
+        ):
+            return False
+        problem, _, _ = self._problem(nodes, worlds)
+        if problem is None or problem.nodes.times[0] != nodes.times[0]:
+            return False
+        count, present = len(self._known), problem.nodes
+        problem.nodes = replace(present, segment=present.segment + count - 1, depth=np.full(count, present.depth[0]))
+        problem.past, problem.held = past, -1 if past.holds else problem.held
+        problem.options = replace(self._smoother, iterations=1)
+        try:
+            found = smooth(problem, self._start(problem, self._known))
+        except np.linalg.LinAlgError:
+            return False
+        self._next = float(nodes.times[-1]) + BETWEEN
+        if not self._doubt(problem, found):
+            self._follow(_joined(known, found))
+        return True
+
+    def _problem(self, nodes: VisualNodes, worlds: list[int]) -> tuple[Smoother | None, list[int], str]:
+        """Problem of nodes that samples cover, and the worlds of its segments; None and why there is none."""
         samples, turn = self.stream.samples(), self.rotation_camera_imu
         if samples is None or len(samples) < 2:
-            return None, "too few samples"
+            return None, worlds, "too few samples"
         if turn is None:
             reason = self._turn_between(nodes, samples)
             turn = self.rotation_camera_imu
             if turn is None:
-                return None, reason
+                return None, worlds, reason
         offset = self.first_offset if self.solution is None else self.solution.time_offset
         lead = 0.03 + abs(offset)
         kept = (nodes.times + lead <= samples.timestamps[-1] + 0.03) & (nodes.times - lead >= samples.timestamps[0])
         if not kept.all():
-            nodes = nodes.where(kept)
+            nodes, worlds = _chosen(nodes, worlds, kept)
         enough = self.options.first if not self.aligned else 2 * self.options.interval
         if len(nodes) < 3 or nodes.times[-1] - nodes.times[0] < enough:
-            return None, "too few poses"
+            return None, worlds, "too few poses"
         near = samples.between(nodes.times[0] - 0.5, nodes.times[-1] + 0.5)
         force = float(np.median(np.linalg.norm(near.accel, axis=1))) if len(near) else 0.0
         if not GRAVITY_RANGE[0] <= force <= GRAVITY_RANGE[1]:
-            return None, f"the median specific force is {force:.3g} m/s^2 where gravity is 9.81: units, or axes"
+            return None, worlds, f"the median specific force is {force:.3g} m/s^2 where gravity is 9.81: units, or axes"
         lever = -turn.T @ self.translation_camera_imu
         problem = Smoother(nodes, near, self.noise, turn, lever, self._smoother, offset=offset)
         if self.solution is None:
@@ -512,7 +551,7 @@ class InertialEstimator:
             at = int(np.abs(self.solution.times - nodes.times[0]).argmin())
             problem.held = self._common(nodes)
             problem.gyro_bias, problem.accel_bias = self.solution.gyro_bias[at], self.solution.accel_bias[at]
-        return problem, ""
+        return problem, worlds, ""
 
     def _turn_between(self, nodes: VisualNodes, samples: InertialSamples) -> str:
         """Find the rotation between sensor and camera; why it is not found."""
@@ -595,20 +634,19 @@ class InertialEstimator:
     @staticmethod
     def _drifts(problem: Smoother, start: Values, known: Smoothed) -> tuple[Array, Array, Array]:
         """Worlds and scales of the segments at their first nodes, and the drift of the others."""
-        nodes = problem.nodes
+        nodes, past = problem.nodes, problem.past
         body = problem.rotation_camera_imu @ so3_exp(start.extrinsic)
         begins = np.flatnonzero(np.concatenate([[True], nodes.segment[1:] != nodes.segment[:-1]]))
-        first = begins[nodes.segment]
-        world = start.rotation[begins] @ np.swapaxes(nodes.rotation[begins] @ body, -1, -2)
-        drift = np.zeros((len(nodes), 4))
-        drift[:, :3] = rotation_vector(
-            start.rotation @ np.swapaxes(world[nodes.segment] @ nodes.rotation @ body, -1, -2)
-        )
         scales = start.log_scale[nodes.segment]
         inside = (nodes.times >= known.times[0] - 1e-6) & (nodes.times <= known.times[-1] + 1e-6)
         scales[inside] = np.interp(nodes.times[inside], known.times, known.log_scale)
-        drift[:, 3] = scales - scales[first]
-        return world, scales[begins], drift
+        if past is None:
+            world = start.rotation[begins] @ np.swapaxes(nodes.rotation[begins] @ body, -1, -2)
+            logs = scales[begins]
+        else:  # the first nodes are before these
+            world, logs = past.values.world, past.values.log_scale
+        turn = rotation_vector(start.rotation @ np.swapaxes(world[nodes.segment] @ nodes.rotation @ body, -1, -2))
+        return world, logs, np.concatenate([turn, (scales - logs[nodes.segment])[:, None]], 1)
 
     def _common(self, nodes: VisualNodes) -> int:
         """The node that is held: of those that the last solution has, the nearest to the one held there."""
@@ -649,8 +687,12 @@ class InertialEstimator:
         turned = nodes.rotation @ problem.rotation_camera_imu
         motion = preintegrate(problem.samples, nodes.times + offset, gyro[:-1], accel[:-1], problem.noise)
         off = rotation_vector(np.swapaxes(motion.rotation, -1, -2) @ np.swapaxes(turned[:-1], -1, -2) @ turned[1:])
-        off = off[motion.covered & (nodes.segment[1:] == nodes.segment[:-1])]
-        angle = float(np.rad2deg(np.sqrt((off**2).sum(-1).mean()))) if len(off) else 0.0
+        inside = motion.covered & (nodes.segment[1:] == nodes.segment[:-1])
+        recent = inside & (nodes.times[:-1] >= nodes.times[-1] - LAST_TURNS)
+        squares = (off**2).sum(-1)
+        angle = float(np.rad2deg(np.sqrt(squares[inside].mean()))) if inside.any() else 0.0
+        if recent.any():  # a sensor that has just been hit; images that jump once do not count
+            angle = max(angle, float(np.rad2deg(np.sqrt(np.median(squares[recent])))))
         if angle > MAX_TURN:
             raise _DisagreementError(
                 f"gyroscope and images turn differently, by {angle:.1f} degrees: axes, time offset or clock"
@@ -705,7 +747,7 @@ class InertialEstimator:
             if again and "is uncertain" not in reason:
                 self._patience = min(2 * self._patience, MOST_PATIENCE)
             else:
-                self._patience = EVERY / 2
+                self._patience = AT_FIRST
             self._next = time + self._patience
             self.reason = reason
             return
@@ -733,21 +775,32 @@ class InertialEstimator:
         new = worlds[-1] not in self.worlds
         if not new or found.scale_sigma <= 2 * self.options.max_scale_sigma:
             self._take(found, worlds)
-        else:  # a new segment, whose scale is not sure yet
+        elif found.scale_sigma < NOTHING_TOLD:  # a new segment, whose scale is not sure yet
             self.solution, self._known = found, list(worlds[: len(found.worlds.log_scale)])
         if time - self._aligned >= REFINED_AFTER:
             self.state = ScaleState.REFINED
 
     def _take(self, found: Smoothed, worlds: list[int]) -> None:
         """Let poses follow an estimate."""
-        self.solution = found
         self._known = list(worlds[: len(found.worlds.log_scale)])
+        self._follow(found)
         state = self.last_state()
         assert state is not None
         self._past.append(state)
+        if found.past is not None:
+            self._next = self._whole + BETWEEN
+
+    def _follow(self, found: Smoothed) -> None:
+        self.solution = found
         for k, world in enumerate(self._known):
             w = found.worlds
             self.worlds[world] = Similarity(float(np.exp(w.log_scale[k])), w.rotation[k], w.translation[k])
+
+
+def _chosen(nodes: VisualNodes, worlds: list[int], keep: Array) -> tuple[VisualNodes, list[int]]:
+    """Nodes that are chosen by a mask ``(N,)``, and the worlds of their segments."""
+    nodes, left = nodes.where(keep)
+    return nodes, [worlds[k] for k in left]
 
 
 def _newest(found: Smoothed, covariance: Array) -> BodyState:
@@ -758,11 +811,26 @@ def _newest(found: Smoothed, covariance: Array) -> BodyState:
     )  # fmt: skip
 
 
+def _joined(before: Smoothed, after: Smoothed) -> Smoothed:
+    """An estimate, and nodes of the one that it goes on from before it."""
+    kept = before.times < after.times[0] - 1e-6
+
+    def joined(early: Array, late: Array) -> Array:
+        return np.concatenate([early[kept], late])
+
+    return replace(
+        after, times=joined(before.times, after.times), segment=joined(before.segment, after.segment),
+        rotation=joined(before.rotation, after.rotation), position=joined(before.position, after.position),
+        velocity=joined(before.velocity, after.velocity), gyro_bias=joined(before.gyro_bias, after.gyro_bias),
+        accel_bias=joined(before.accel_bias, after.accel_bias), log_scale=joined(before.log_scale, after.log_scale),
+    )  # fmt: skip
+
+
 def _from_first_camera(found: Smoothed) -> Smoothed:
     """An estimate of one segment, whose origin moves to the place of the first camera."""
     origin = found.worlds.translation[-1]
     worlds = replace(found.worlds, translation=found.worlds.translation - origin)
-    return replace(found, position=found.position - origin, worlds=worlds)
+    return replace(found, position=found.position - origin, worlds=worlds, past=None)
 
 
 def _turns(samples: InertialSamples, sensor: ImuAlignment, times: Array, offsets: Array) -> Array:

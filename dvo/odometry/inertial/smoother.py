@@ -20,7 +20,7 @@ import numpy as np
 
 from dvo.data.inertial import ImuNoise, InertialSamples
 from dvo.geometry.poses import rotation_vector, skew, so3_exp
-from dvo.odometry.inertial.chain import ChainSolution, ChainSystem, solve_chain
+from dvo.odometry.inertial.chain import ChainSolution, ChainSystem, marginal, solve_chain
 from dvo.odometry.inertial.preintegration import Preintegration, preintegrate
 
 Array = np.ndarray
@@ -37,6 +37,8 @@ WIDTH = 6.0
 """Of the robust kernel of visual residuals, deviations."""
 SHIFTED = 0.8
 """Visual shift that goes with a visual turn that is wrong, in usual depths of the scene."""
+RECENT = 2.0
+"""Seconds before the newest node from which an estimate goes on, until the next one of the whole window."""
 USUAL = 10.0
 """Measurements that the usual noise of visual poses counts for, where it is estimated."""
 _FIXED = 1e18  # information of an unknown that is held
@@ -65,17 +67,15 @@ class VisualNodes:
     def __len__(self) -> int:
         return len(self.times)
 
-    def where(self, keep: Array) -> VisualNodes:
-        """Nodes that are chosen by a mask ``(N,)``."""
-        return replace(
-            self, times=self.times[keep], segment=self.segment[keep], rotation=self.rotation[keep],
-            position=self.position[keep],
-        )  # fmt: skip
+    def where(self, keep: Array) -> tuple[VisualNodes, Array]:
+        """Nodes that are chosen by a mask ``(N,)``, and the numbers so far of the segments that are left."""
+        left, segment = np.unique(self.segment[keep], return_inverse=True)
+        nodes = VisualNodes(self.times[keep], segment, self.rotation[keep], self.position[keep], self.depth[left])
+        return nodes, left
 
     def of(self, segment: int) -> VisualNodes:
         """Nodes of one segment, which becomes the only one."""
-        chosen = self.where(self.segment == segment)
-        return replace(chosen, segment=np.zeros(len(chosen), int), depth=self.depth[segment : segment + 1])
+        return self.where(self.segment == segment)[0]
 
 
 @dataclass(frozen=True)
@@ -144,6 +144,7 @@ class Smoothed:
 
     Attributes:
         times: ``(N,)`` of the nodes, clock of the camera.
+        segment: ``(N,)`` of the nodes.
         rotation: ``(N, 3, 3)`` body to world.
         position, velocity: ``(N, 3)`` of the body, metres and m/s.
         gyro_bias, accel_bias: ``(N, 3)``.
@@ -158,10 +159,13 @@ class Smoothed:
         cost: half of the sum of squares.
         inertial_error: mean squared whitened residual of the preintegrated motion.
         visual_error: ``(3,)`` sum of squared whitened residuals of visual orientations with their drift, of visual
-            displacements, and of the drift of the scale, over its expectation: 1 if the noise is that of the options.
+            displacements, and of the drift of the scale, over its expectation: 1 if the noise is that of the options,
+            and of an estimate that goes on from another one.
+        past: of the node :data:`RECENT` seconds before the newest, in the newest segment; None where there is none.
     """
 
     times: Array
+    segment: Array
     rotation: Array
     position: Array
     velocity: Array
@@ -177,6 +181,7 @@ class Smoothed:
     cost: float
     inertial_error: float
     visual_error: Array
+    past: Past | None = None
 
     @property
     def scale_sigma(self) -> float:
@@ -209,6 +214,33 @@ class Values:
         """``(N,)`` log scale of each node."""
         return self.log_scale[segment] + self.drift[:, 3]
 
+    def part(self, rows: slice) -> Values:
+        """Those of some nodes."""
+        return replace(
+            self, rotation=self.rotation[rows], position=self.position[rows], velocity=self.velocity[rows],
+            bias=self.bias[rows], drift=self.drift[rows],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Past:
+    """What the measurements up to a node tell of it and of the shared unknowns: normal equations about some values.
+
+    Attributes:
+        time: of the node, seconds.
+        values: of this node alone, and the shared ones.
+        information, right: ``(19 + m, 19 + m)`` and ``(19 + m,)``.
+        worlds: of the segments; the node is of the last one.
+        holds: heading and position of the node that is held are in it.
+    """
+
+    time: float
+    values: Values
+    information: Array
+    right: Array
+    worlds: Similarities
+    holds: bool
+
 
 @dataclass
 class Smoother:
@@ -224,6 +256,7 @@ class Smoother:
         gyro_bias, accel_bias: ``(3,)`` known before.
         offset: time offset known before, seconds.
         held: node whose heading and position are held, as the samples do not tell them.
+        past: of the first node; None: there is nothing before it.
     """
 
     nodes: VisualNodes
@@ -236,6 +269,7 @@ class Smoother:
     accel_bias: Array = field(default_factory=lambda: np.zeros(3))
     offset: float = 0.0
     held: int = 0
+    past: Past | None = None
 
     @property
     def segments(self) -> int:
@@ -391,24 +425,47 @@ def smooth(problem: Smoother, start: Values) -> Smoothed:
         values, system, cost, error, damping = moved, further, lower, found, damping / 10
         if done:
             break
-    solved, scales = solve_chain(system, pairs=True), values.scales(problem.nodes.segment)
+    solved, scales = solve_chain(system, pairs=problem.past is None), values.scales(problem.nodes.segment)
     return Smoothed(
-        problem.nodes.times, values.rotation, values.position, values.velocity, values.bias[:, :3], values.bias[:, 3:],
-        scales, _worlds(problem, values), values.offset, problem.rotation_camera_imu @ so3_exp(values.extrinsic),
-        problem.lever, float(np.exp(scales[-1]) * problem.nodes.depth[-1]), solved.covariance, cost, error,
-        _visual_error(problem, values, solved),
+        problem.nodes.times, problem.nodes.segment, values.rotation, values.position, values.velocity,
+        values.bias[:, :3], values.bias[:, 3:], scales, _worlds(problem, values), values.offset,
+        problem.rotation_camera_imu @ so3_exp(values.extrinsic), problem.lever,
+        float(np.exp(scales[-1]) * problem.nodes.depth[-1]), solved.covariance, cost, error,
+        _visual_error(problem, values, solved), _past(problem, values) if problem.past is None else problem.past,
     )  # fmt: skip
 
 
-def _worlds(problem: Smoother, values: Values) -> Similarities:
-    """Similarity of each segment at its newest node."""
+def _past(problem: Smoother, values: Values) -> Past | None:
+    """What the nodes tell that are older than the last seconds."""
     nodes = problem.nodes
-    last = np.array([np.flatnonzero(nodes.segment == k)[-1] for k in range(problem.segments)])
+    recent = np.flatnonzero((nodes.segment == nodes.segment[-1]) & (nodes.times >= nodes.times[-1] - RECENT))
+    count = int(recent[0]) + 1
+    if count < 2:
+        return None
+    early, part = replace(problem, nodes=nodes.where(np.arange(len(nodes)) < count)[0]), values.part(slice(count))
+    information, right = marginal(_linearise(early, part, early.preintegrated(part))[0])
+    newest = values.part(slice(count - 1, count))
+    return Past(
+        float(nodes.times[count - 1]), newest, information, right, _worlds(problem, values), problem.held < count
+    )
+
+
+def _worlds(problem: Smoother, values: Values) -> Similarities:
+    """Similarity of each segment at its newest node; those of segments before the nodes stay."""
+    nodes, first = problem.nodes, int(problem.nodes.segment[0])
+    last = np.array([np.flatnonzero(nodes.segment == k)[-1] for k in range(first, problem.segments)])
     body = problem.rotation_camera_imu @ so3_exp(values.extrinsic)
     rotation = values.rotation[last] @ _turn(nodes.rotation[last] @ body)
     scales = values.scales(nodes.segment)[last]
     camera = values.position[last] + _apply(values.rotation[last], np.broadcast_to(problem.lever, (len(last), 3)))
-    return Similarities(scales, rotation, camera - np.exp(scales)[:, None] * _apply(rotation, nodes.position[last]))
+    translation = camera - np.exp(scales)[:, None] * _apply(rotation, nodes.position[last])
+    if problem.past is None:
+        return Similarities(scales, rotation, translation)
+    known = problem.past.worlds
+    return Similarities(
+        np.concatenate([known.log_scale[:first], scales]), np.concatenate([known.rotation[:first], rotation]),
+        np.concatenate([known.translation[:first], translation]),
+    )  # fmt: skip
 
 
 def _inverse_right_jacobian(phi: Array) -> Array:
@@ -546,7 +603,8 @@ def _drift_sigma(problem: Smoother) -> Array:
 def _add_visual(problem: Smoother, values: Values, system: ChainSystem) -> float:
     """Visual orientations and displacements, and their drift; cost."""
     segment = problem.nodes.segment
-    held, index = np.flatnonzero(np.concatenate([[True], segment[1:] != segment[:-1]])), np.arange(STATE, NODE)
+    begins = np.concatenate([[problem.past is None], segment[1:] != segment[:-1]])
+    held, index = np.flatnonzero(begins), np.arange(STATE, NODE)
     system.diagonal[held[:, None], index, index] += _FIXED  # the drift of a segment begins with its first node
     drift = _add_walk(system, values.drift, _drift_sigma(problem), STATE)
     turns, by_turns = _orientations(problem, values)
@@ -600,7 +658,11 @@ def _orientations(problem: Smoother, values: Values) -> tuple[_Residuals, float]
     turn = rotation_vector(values.rotation @ _turn(values.world[segment] @ nodes.rotation @ body))
     angle = options.rotation_sigma * options.rotation_factor
     residual = (turn - values.drift[:, :3]) / angle
+    if problem.past is not None:
+        residual[0] = 0.0  # it has been counted
     robust, cost = _robust(residual)
+    if problem.past is not None:
+        robust[0] = 0.0
     states = np.zeros((len(nodes), 3, NODE))
     shared = np.zeros((len(nodes), 3, _SEGMENT + 4 * problem.segments))
     states[:, :, :3], states[:, :, STATE : STATE + 3] = values.rotation, -np.eye(3)
@@ -653,7 +715,13 @@ def _displacements(problem: Smoother, values: Values) -> tuple[_Residuals, float
 
 
 def _add_priors(problem: Smoother, values: Values, system: ChainSystem) -> float:
-    """Biases of the first node, time offset, extrinsic rotation; heading and position of one node are held."""
+    """What is known before of the first node and the shared unknowns; heading and position of one node are held."""
+    if 0 <= problem.held < len(problem.nodes):
+        index, up = np.arange(3, 6), values.rotation[problem.held][2]
+        system.diagonal[problem.held, index, index] += _FIXED
+        system.diagonal[problem.held, :3, :3] += _HELD * np.outer(up, up)
+    if problem.past is not None:
+        return _add_past(problem, problem.past, values, system)
     noise, options = problem.noise, problem.options
     known = np.concatenate([problem.gyro_bias, problem.accel_bias])
     sigma = np.repeat([noise.gyro_bias, noise.accel_bias], 3)
@@ -668,10 +736,32 @@ def _add_priors(problem: Smoother, values: Values, system: ChainSystem) -> float
     index = np.arange(1, 4)
     system.shared[index, index] += 1 / options.extrinsic_sigma**2
     system.right_shared[_EXTRINSIC] -= tilt / options.extrinsic_sigma
-    index, up = np.arange(3, 6), values.rotation[problem.held][2]
-    system.diagonal[problem.held, index, index] += _FIXED
-    system.diagonal[problem.held, :3, :3] += _HELD * np.outer(up, up)
     # Very weak, so that a scale without any measurement does not run away.
     scales = _SEGMENT + 4 * np.arange(problem.segments)
     system.shared[scales, scales] += 1e-2
     return 0.5 * float((off**2).sum() + late**2 + (tilt**2).sum())
+
+
+def _add_past(problem: Smoother, past: Past, values: Values, system: ChainSystem) -> float:
+    """What the nodes before the first one tell, about the values that they were linearised at."""
+    then, late = past.values, values.offset - past.values.offset
+    # A node with another time offset is a state at another time (:func:`_moved`), which is no change of it.
+    states = np.concatenate(
+        [
+            rotation_vector(then.rotation[0].T @ values.rotation[0]) - problem.rates(values)[0] * late,
+            values.position[0] - then.position[0] - values.velocity[0] * late,
+            values.velocity[0] - then.velocity[0] - problem.accelerations(values)[0] * late,
+            values.bias[0] - then.bias[0],
+            values.drift[0] - then.drift[0],
+        ]
+    )
+    turned = rotation_vector(values.world @ _turn(then.world))
+    worlds = np.concatenate([(values.log_scale - then.log_scale)[:, None], turned], 1)
+    change = np.concatenate([states, [late], values.extrinsic - then.extrinsic, worlds.ravel()])
+    right = past.right - past.information @ change
+    system.diagonal[0] += past.information[:NODE, :NODE]
+    system.border[0] += past.information[:NODE, NODE:]
+    system.shared += past.information[NODE:, NODE:]
+    system.right[0] += right[:NODE]
+    system.right_shared += right[NODE:]
+    return -0.5 * float(change @ (past.right + right))

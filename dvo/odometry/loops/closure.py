@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -31,6 +31,7 @@ from torch import Tensor
 
 from dvo.geometry import sim3, so3
 from dvo.map.archive import ArchivedKeyframe
+from dvo.map.correction import Carried, Moved
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.odometry.frames.front_end import View
 from dvo.odometry.global_ba.graph_adjustment import AdjustmentRecord
@@ -39,7 +40,7 @@ from dvo.odometry.loops.check import median_inverse_depth
 from dvo.odometry.loops.finder import Loop, LoopFinder
 from dvo.odometry.loops.relocalisation import Located, locate
 from dvo.odometry.maintenance.adjuster import Adjuster
-from dvo.odometry.maintenance.maintenance import Job, MapMaintenance, Moved
+from dvo.odometry.maintenance.maintenance import Job, MapMaintenance
 
 CONFIRM_WITHIN = 4
 """Searches after a loop within which a second one has to confirm it."""
@@ -57,7 +58,7 @@ class LoopCloser:
         enabled: search for loops; otherwise nothing is kept or found.
         maintenance: of the map: the job in progress, and when its result is taken.
         adjuster: of global adjustments; None for no adjustments.
-        follow: is told of corrections that move the window.
+        follow: is told how the newest poses of each world have moved.
 
     Attributes:
         loops: confirmed loops, in the order of their discovery.
@@ -72,7 +73,7 @@ class LoopCloser:
     enabled: bool = True
     maintenance: MapMaintenance = field(default_factory=MapMaintenance)
     adjuster: Adjuster | None = None
-    follow: loop_correction.Follow | None = None
+    follow: Callable[[Carried], None] | None = None
     loops: list[Loop] = field(default_factory=list)
     corrections: int = 0
     wait: int = 0
@@ -269,7 +270,7 @@ class LoopCloser:
     def _searched(self, loop: Loop | None) -> Moved:
         """Take the outcome of a search, which moves nothing by itself."""
         self._found(loop)
-        return {}
+        return Moved({})
 
     def _found(self, loop: Loop | None) -> None:
         """Take the outcome of a search."""
@@ -332,14 +333,16 @@ class LoopCloser:
         later = self.graph.archive.kept_after(self.finder.kept[-1])
         kept = [*self.finder.kept, *(frame.identifier for frame in later)]
         self.corrections += 1
-        return loop_correction.apply(self.graph, kept, self.loops[-1], identifiers, found, self.follow)
+        return loop_correction.apply(self.graph, kept, self.loops[-1], identifiers, found)
 
-    def moved(self, units: Moved) -> None:
-        """Express the loops in new units of keyframes.
+    def moved(self, moved: Moved) -> None:
+        """Express the loops in new units of keyframes, and tell who follows the newest poses.
 
         Args:
-            units: scale of the similarity of each keyframe (:func:`dvo.map.correction.apply_similarities`); those that
-                are not named keep theirs.
+            moved: what has moved; keyframes that are not named keep their unit.
         """
-        self.loops[:] = [loop.in_units(units) for loop in self.loops]
-        self.pending = None if self.pending is None else self.pending.in_units(units)
+        self.loops[:] = [loop.in_units(moved.units) for loop in self.loops]
+        self.pending = None if self.pending is None else self.pending.in_units(moved.units)
+        if self.follow is not None:
+            for carried in moved.worlds:
+                self.follow(carried)

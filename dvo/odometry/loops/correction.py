@@ -6,7 +6,7 @@ are archived meanwhile, and the window, are moved along with the last keyframe b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dvo.ba.pose_graph import LOOP_OPTIONS, optimise_pose_graph
 from dvo.geometry import se3, sim3
-from dvo.map.correction import apply_similarities, move_window, similarity_between, window_carrier
+from dvo.map.correction import Moved, apply_similarities, carry, similarity_between
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.map import Map
 from dvo.odometry.loops.check import median_inverse_depth
@@ -116,15 +116,9 @@ def solve(graph: Map, kept: Sequence[int], loops: Sequence[Loop], loop: Loop) ->
     return correction.identifiers, correction.solve()
 
 
-Follow = Callable[[int, Tensor, float], None]
-"""Takes the world of the newest poses before a correction, the similarity ``(8,)`` from it to their world after it, and
-the time of the last keyframe that was corrected, seconds."""
-
-
 def apply(
-    graph: KeyframeGraph, kept: Sequence[int], loop: Loop, identifiers: np.ndarray, found: Tensor,
-    follow: Follow | None = None,
-) -> dict[int, float]:  # fmt: skip
+    graph: KeyframeGraph, kept: Sequence[int], loop: Loop, identifiers: np.ndarray, found: Tensor
+) -> Moved:  # fmt: skip
     """Correct the keyframes of the worlds of a loop, and the window if it is in one of them; join its worlds.
 
     Args:
@@ -133,24 +127,18 @@ def apply(
         loop: the loop.
         identifiers: ``(N,)`` of the keyframes of the pose graph.
         found: ``(N, 8)`` its solution.
-        follow: is told of a correction that moves the window.
 
     Returns:
-        New unit of each keyframe of these worlds, in old ones.
+        What has moved: keyframes of these worlds.
     """
     now = members(graph, kept, loop)
     found = _carried(graph, identifiers, found, now)
     before, held = graph.poses_cw(now), held_keyframes(graph, now)
-    carrier, present = window_carrier(graph, now), graph.world_of(graph.segment)
     apply_similarities(graph, now[~held], found[torch.from_numpy(~held)])
-    if carrier is not None:
-        move_window(graph, before[carrier], found[carrier])
+    carried = carry(graph, now, before, found)
     if loop.joins:
         graph.join(graph.segment_of(loop.new), graph.segment_of(loop.old))
-    if follow is not None and carrier is not None:
-        change = sim3.compose(sim3.inverse(found[carrier]), sim3.from_se3(before[carrier]))
-        follow(present, change, graph.archive[int(now[-1])].timestamp)
-    return dict(zip(now.tolist(), found[:, 7].tolist(), strict=True))
+    return Moved(dict(zip(now.tolist(), found[:, 7].tolist(), strict=True)), carried)
 
 
 def held_keyframes(graph: Map, identifiers: np.ndarray) -> np.ndarray:

@@ -7,11 +7,12 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
+from dvo.map.correction import Moved
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.global_ba.graph_adjustment import Adjusted, AdjustmentLimits, AdjustmentRecord, Cause, apply, prepare
 from dvo.odometry.global_ba.rolling_shutter import Shutter
-from dvo.odometry.maintenance.maintenance import Job, MapMaintenance, Moved
+from dvo.odometry.maintenance.maintenance import Job, MapMaintenance
 
 
 @dataclass
@@ -81,12 +82,11 @@ class Adjuster:
             begun: time of the frame that it was begun with, seconds.
 
         Returns:
-            New unit of each keyframe that has moved, in old ones
-            (:func:`dvo.odometry.global_ba.graph_adjustment.apply`).
+            What has moved (:func:`dvo.odometry.global_ba.graph_adjustment.apply`).
         """
         if len(found.identifiers):
             self.records.append(found.record(begun, self._time(), cause))
-        return apply(self.graph, world, found) if found.better else {}
+        return apply(self.graph, world, found) if found.better else Moved({})
 
     def want(self, worlds: Iterable[int]) -> None:
         """Take up worlds that wait for their adjustment.

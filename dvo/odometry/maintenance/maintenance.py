@@ -8,18 +8,17 @@ moved is told as one message, which everything follows that must.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
 from dvo.core.context import core_free
+from dvo.map.correction import Moved
 from dvo.odometry.maintenance.background import Background, Steps, StepsAhead, Task, all_steps
 
 T = TypeVar("T")
 Kind = Literal["search", "correction", "adjustment"]
-Moved = Mapping[int, float]
-"""New unit of each keyframe that a job has moved, in old ones: the scale of its similarity."""
 
 
 @dataclass
@@ -42,11 +41,11 @@ class Job(Generic[T]):
 class Owner(Protocol):
     """What a map maintenance reports to."""
 
-    def moved(self, units: Moved) -> None:
-        """Follow keyframes that have moved.
+    def moved(self, moved: Moved) -> None:
+        """Follow what has moved.
 
         Args:
-            units: see :data:`Moved`.
+            moved: by the job that has just been applied.
         """
         ...
 

@@ -18,7 +18,7 @@ from dvo.data.inertial import InertialSamples, checked_samples
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
 from dvo.geometry.poses import matrix_to_quaternion, pose_from, quaternion_to_matrix, rotation_vector, slerp, split
-from dvo.map.correction import apply_similarities, keyframes_of
+from dvo.map.correction import Carried, Moved, apply_similarities, keyframes_of
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
 from dvo.odometry.global_ba.rolling_shutter import Turns
@@ -133,7 +133,9 @@ class InertialTracking:
             self._compare(time, estimate.pose_wc)
             if self.metric:
                 return estimate
-            if estimator.due(time) or self._anchor is not None:
+            if self._anchor is None:
+                estimator.refresh(time, self._nodes)
+            else:
                 estimator.update(*self._nodes(time - self.options.window))
             similarity = self._similarity()
             if similarity is not None:
@@ -199,7 +201,7 @@ class InertialTracking:
             if smoothed is not None and world in worlds:
                 path = _path(smoothed, nodes, np.array(worlds)[nodes.segment] == world)
             units |= self._follow(world, _Path.constant(similarity) if path is None else path)
-        loops.moved(units)
+        loops.moved(Moved(units))
         begun, entries = graph.recording.segment, []
         for world, similarity in sorted(found.items()):
             graph.metric[world] = "inertial"
@@ -215,21 +217,20 @@ class InertialTracking:
         scale = {"source": "inertial", "unit": "metres", "segments": entries}
         return {"inertial": estimator.information(), **({"scale": scale} if entries else {})}
 
-    def corrected(self, present: int, change: Tensor, time: float) -> None:
-        """Follow a correction by loops, after which the present segment is in the world that it belongs to now.
+    def corrected(self, carried: Carried) -> None:
+        """Follow a correction of the map, after which each segment is in the world that it belongs to.
 
         Args:
-            present: number of the world that it was in.
-            change: ``(8,)`` similarity of the newest poses, from that world before to the one after.
-            time: of the last keyframe that was corrected, seconds.
+            carried: how the newest poses of a world have moved.
         """
-        rotation, translation = split(change[:7].numpy())
-        by = Similarity(float(change[7]), rotation, translation)
-        self._last, self._before = (
-            None if known is None else (known[0], _changed(known[1], by)) for known in (self._last, self._before)
-        )
+        rotation, translation = split(carried.change[:7].numpy())
+        by = Similarity(float(carried.change[7]), rotation, translation)
+        if carried.window:
+            self._last, self._before = (
+                None if known is None else (known[0], _changed(known[1], by)) for known in (self._last, self._before)
+            )
         if not self.metric and self.estimator.aligned:
-            self.estimator.corrected(present, self.graph.world_of(self.graph.segment), by, time)
+            self.estimator.corrected(carried.world, self.graph.world_of(carried.world), by, carried.time)
 
     def _follow(self, world: int, path: _Path) -> dict[int, float]:
         """Move the kept keyframes of a world; the scale of the similarity of each."""

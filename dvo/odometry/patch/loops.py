@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 
+from dvo.map.correction import Carried
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.places import PlaceIndex
 from dvo.models.patch_vo import PatchVO
 from dvo.odometry.loops.closure import LoopCloser
-from dvo.odometry.loops.correction import Follow
 from dvo.odometry.loops.finder import LoopFinder
 from dvo.odometry.loops.joint_window import GroupMatcher
 from dvo.odometry.loops.place_descriptors import PLACE_DESCRIPTORS, PlaceDescriptor
@@ -20,7 +22,7 @@ from dvo.odometry.patch.state import TrackerState
 
 def loop_closer(
     model: PatchVO, config: TrackerConfig, graph: KeyframeGraph, device: torch.device, state: TrackerState,
-    follow: Follow,
+    follow: Callable[[Carried], None],
 ) -> LoopCloser:  # fmt: skip
     """Loop closure of a tracker.
 
@@ -30,7 +32,7 @@ def loop_closer(
         graph: of the tracker.
         device: of the computation.
         state: of the tracker.
-        follow: is told of corrections that move the window.
+        follow: is told how the newest poses of each world have moved.
     """
     build = PLACE_DESCRIPTORS.resolve(config.loop.descriptor)
     described: PlaceDescriptor | None = build(model.config.feature_channels)

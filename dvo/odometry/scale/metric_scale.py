@@ -17,7 +17,7 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory, interpolate
 from dvo.map.archive import ArchivedKeyframe
-from dvo.map.correction import rescale
+from dvo.map.correction import Moved, rescale
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.odometry.depth.depth_factor import metres_of_unit
 from dvo.odometry.depth.scale_options import ScaleOptions
@@ -79,7 +79,7 @@ def settle_scale(
                 if not options.measures:
                     units = rescale(graph, world, known[world].factor)
                     if loops is not None:
-                        loops.moved(units)
+                        loops.moved(Moved(units))
                 graph.metric[world] = options.source
     if not known:
         return {}

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import dvo
 from dvo.core.errors import DvoError
-from dvo.geometry import se3
+from dvo.geometry import se3, sim3
 from dvo.map.map import Recording
 from dvo.map.measurements import ArchivedEdges
 from dvo.metrics import evaluate
@@ -50,7 +50,7 @@ def test_poses_and_depths_are_found_from_a_snapshot():
     assert np.array_equal(solved[0].inverse_depths, solved[1].inverse_depths)
     assert torch.equal(solved[0].similarities, solved[1].similarities)
     assert solved[0].better and solved[0].cost_before == cost(graph)
-    unit = apply(graph, 0, solved[0])
+    unit = apply(graph, 0, solved[0]).units
     assert list(solved[0].identifiers) == list(range(1, 40)) and list(unit) == [
         k for k in range(1, 40) if k not in DROPPED
     ]
@@ -77,7 +77,7 @@ def test_a_solution_that_is_no_better_changes_nothing():
     before, found = state(graph), prepared(graph).solve()
     adjuster = Adjuster(graph, Shutter, AdjustmentOptions())
     worse = replace(found, cost=found.cost_before)
-    assert adjuster.take(worse, 0, "request", 1.5) == {}
+    assert not adjuster.take(worse, 0, "request", 1.5)
     for mine, other in zip(before, state(graph), strict=True):
         assert np.array_equal(mine, other)
     (entry,) = adjuster.information()["adjustments"]
@@ -131,8 +131,14 @@ def test_what_is_archived_later_and_the_window_move_along():
 
     before, depths = steps(), graph.window.patches[:, 2].clone()
     dropped, later = graph.archive[24].pose_cw[:3].copy(), graph.archive[22].inverse_depth
-    unit = apply(graph, 0, found)
+    newest = se3.inverse(graph.window.poses_cw.double())
+    moved = apply(graph, 0, found)
+    unit, (carried,) = moved.units, moved.worlds
     scale = unit[19]
+    assert carried.window and carried.world == 0 and carried.time == graph.archive[22].timestamp
+    assert float(carried.change[7]) == pytest.approx(1 / scale)
+    expected = se3.inverse(graph.window.poses_cw.double())
+    assert torch.allclose(sim3.act_on_pose(carried.change, newest)[:, :3], expected[:, :3], atol=1e-5)
     assert abs(scale - 1) > 0.01 and unit[22] == pytest.approx(scale)
     assert torch.allclose(steps()[:, 3:], before[:, 3:], atol=1e-6)
     assert torch.allclose(steps()[:, :3], before[:, :3] / scale, atol=1e-5)
@@ -170,7 +176,7 @@ def test_a_short_or_unknown_world_is_left_alone():
     for world in (0, 5):
         task = Background().start(prepare(graph, world, GLOBAL, AdjustmentOptions()).solve)
         assert not task.result().better
-        assert adjuster.take(task.result(), world, "request", 0.0) == {}
+        assert not adjuster.take(task.result(), world, "request", 0.0)
     assert adjuster.information() == {}
     assert replace(adjuster, after_loop=True).information() == {"adjustments": []}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvo.odometry.inertial.chain import ChainSystem, solve_chain
+from dvo.odometry.inertial.chain import ChainSystem, marginal, solve_chain
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
@@ -31,6 +31,9 @@ def test_solution_and_covariance_are_those_of_the_dense_system(count: int, share
     np.testing.assert_allclose(np.concatenate([found.states.ravel(), found.shared]), expected, atol=1e-9)
     kept = slice((count - 1) * n, None)
     np.testing.assert_allclose(found.covariance, np.linalg.inv(dense)[kept, kept], atol=1e-9)
+    information, side = marginal(system)
+    np.testing.assert_allclose(np.linalg.inv(information), found.covariance, atol=1e-9)
+    np.testing.assert_allclose(found.covariance @ side, expected[kept], atol=1e-9)
     everything, covariance = solve_chain(system, pairs=True), np.linalg.inv(dense)
     assert found.pairs is None and everything.pairs is not None and len(everything.pairs) == count - 1
     for k, pair in enumerate(everything.pairs):

@@ -17,16 +17,19 @@ from dvo.odometry.protocol import ScaleState
 from tests.support.visual_inertial import CAMERA_IMU, LEVER, SCALE, Recording, record
 
 
+def feed(estimator: InertialEstimator, recording: Recording, time: float) -> None:
+    """Give an estimator samples and visual poses up to a frame."""
+    estimator.add(recording.samples.between(estimator.stream.end, time))
+    estimator.refresh(time, lambda since: (recording.nodes(since, time), [0]))
+
+
 def drive(recording: Recording, until: float = np.inf) -> tuple[InertialEstimator, list[str]]:
     """Feed frames to an estimator; the reasons that it gave, each once."""
-    estimator, reasons, before = InertialEstimator(InertialOptions()), [], -np.inf
+    estimator, reasons = InertialEstimator(InertialOptions()), []
     for time in recording.times[recording.times <= until]:
-        estimator.add(recording.samples.between(before, time))
-        before = time
-        if estimator.due(time):
-            estimator.update(recording.nodes(time - 20.0, time), [0])
-            if estimator.reason not in reasons:
-                reasons.append(estimator.reason)
+        feed(estimator, recording, time)
+        if estimator.reason not in reasons:
+            reasons.append(estimator.reason)
     return estimator, reasons
 
 
@@ -63,16 +66,39 @@ def test_motion_that_does_not_tell_is_refused_with_the_reason(options: dict[str,
 )
 def test_no_alignment_is_wrong_during_and_after_such_motion(options: dict[str, object], grade: str) -> None:
     recording = record(40, still=4.0, seconds=10.0, grade=grade, walk=2e-3, **options)  # type: ignore[arg-type]
-    estimator, before = InertialEstimator(InertialOptions()), -np.inf
+    estimator = InertialEstimator(InertialOptions())
     for time in recording.times:
-        estimator.add(recording.samples.between(before, time))
-        before = time
-        if estimator.due(time):
-            estimator.update(recording.nodes(time - 20.0, time), [0])
+        feed(estimator, recording, time)
         for world in estimator.worlds.values():
             assert world.scale == pytest.approx(SCALE, rel=0.1)
             assert (world.rotation @ recording.turn)[2, 2] > np.cos(np.deg2rad(5.0))
     assert estimator.aligned
+
+
+def test_an_estimate_that_goes_on_is_that_of_the_whole_window() -> None:
+    """For a second, from what the poses before the last two seconds told."""
+    differences = []
+    for seed in range(3):
+        recording = record(seed, seconds=9.0, walk=2e-3, unit=1.5e-2)
+        estimator, later = drive(recording, until=7.0)[0], iter(recording.times[recording.times > 7.0])
+        first = estimator.solution
+        while first is not None and estimator.solution is not None and estimator.solution.past is first.past:
+            feed(estimator, recording, next(later))
+        before = estimator.solution  # of the whole window
+        for _ in range(14):
+            feed(estimator, recording, next(later))
+        found, end = estimator.solution, estimator.stream.end
+        assert before is not None and found is not None and found is not before and found.past is before.past
+        whole = drive(recording, until=before.times[-1])[0]
+        whole.add(recording.samples.between(whole.stream.end, end))
+        whole.update(recording.nodes(end - 20.0, found.times[-1]), [0])
+        expected = whole.solution
+        assert expected is not None and expected.times[-1] == found.times[-1]
+        differences.append([s.log_scale[-1] - expected.log_scale[-1] for s in (found, before)])
+        assert np.linalg.norm(found.position[-1] - expected.position[-1]) < 0.01
+        assert found.scale_sigma == pytest.approx(expected.scale_sigma, rel=0.1)
+    gone_on, left = np.sqrt(np.square(differences).mean(0))
+    assert gone_on < 0.3 * left
 
 
 @pytest.mark.long
@@ -135,15 +161,29 @@ def test_an_alignment_that_fails_later_is_withdrawn() -> None:
     assert [entry["event"] for entry in estimator.history][:2] == ["aligned", "withdrawn"]
 
 
+@pytest.mark.long
+def test_an_alignment_is_withdrawn_when_the_sensor_falls_before_the_scale_is_wrong() -> None:
+    """Biases of 0.2 rad/s and 2 m/s^2 from one sample to the next."""
+    recording = record(5, seconds=13.0)
+    s = recording.samples
+    after = (s.timestamps > 8.0)[:, None]
+    recording = recording.with_samples(gyro=s.gyro + after * [0.12, 0.16, 0.0], accel=s.accel + after * [0.0, 1.2, 1.6])
+    estimator = InertialEstimator(InertialOptions())
+    for time in recording.times:
+        feed(estimator, recording, time)
+        for world in estimator.worlds.values():
+            assert world.scale == pytest.approx(SCALE, rel=0.1)
+    aligned, withdrawn = estimator.history[:2]
+    assert (aligned["event"], withdrawn["event"]) == ("aligned", "withdrawn")
+    assert 8.0 < withdrawn["time"] < 12.5
+
+
 def _consistency(recording: Recording, window: float) -> np.ndarray:
     """NEES ``(K, 3)`` of position, orientation and velocity of poses as they come, from the one at the alignment on."""
-    estimator, before, rows = InertialEstimator(InertialOptions(window=window)), -np.inf, []
+    estimator, rows = InertialEstimator(InertialOptions(window=window)), []
     upright, origin = np.eye(3), None
     for k, time in enumerate(recording.times):
-        estimator.add(recording.samples.between(before, time))
-        before = time
-        if estimator.due(time):
-            estimator.update(recording.nodes(time - window, time), [0])
+        feed(estimator, recording, time)
         if not estimator.aligned:
             continue
         world, (true, body, velocity) = estimator.worlds[0], (part[k] for part in recording.body)
@@ -302,8 +342,14 @@ def test_a_new_segment_after_the_dark_is_joined_and_withdraws_nothing() -> None:
     late = recording.times >= 9.0
     for time in recording.times[late & (recording.times < 13.0)]:
         estimator.add(recording.samples.between(estimator.stream.end, time))
-        if estimator.due(time):
-            estimator.update(parts(recording, [(0.0, 7.0), (9.0, time)], [SAME, OTHER]), [0, 4])
+        estimator.refresh(
+            time,
+            lambda since, time=time: (
+                (parts(recording, [(since, time)], [OTHER]), [4])
+                if since >= 9.0
+                else (parts(recording, [(0.0, 7.0), (9.0, time)], [SAME, OTHER]), [0, 4])
+            ),
+        )
     assert estimator.aligned and [entry["event"] for entry in estimator.history] == ["aligned"]
     assert estimator.worlds[4].scale == pytest.approx(SCALE / OTHER.scale, rel=0.05)
     shown = recording.position[late][0]
@@ -313,6 +359,18 @@ def test_a_new_segment_after_the_dark_is_joined_and_withdraws_nothing() -> None:
     turn = estimator.worlds[4].rotation @ OTHER.rotation @ estimator.worlds[0].rotation.T
     assert np.linalg.norm(rotation_vector(turn)) < np.deg2rad(0.5)
     assert (estimator.worlds[4].rotation @ OTHER.rotation @ recording.turn)[2, 2] > np.cos(np.deg2rad(0.3))
+
+
+def test_a_segment_before_the_one_that_is_aligned_takes_no_part() -> None:
+    recording = record(11, seconds=14.0)
+    estimator = InertialEstimator(InertialOptions())
+    estimator.add(recording.samples)
+    for time in np.arange(2.5, 9.0, 0.5):
+        estimator.update(parts(recording, [(0.1, 1.5), (1.8, time)], [SAME, OTHER]), [0, 1])
+    assert estimator.aligned and set(estimator.worlds) == {1}
+    assert estimator.worlds[1].scale == pytest.approx(SCALE / OTHER.scale, rel=0.05)
+    found = estimator.settle(parts(recording, [(0.1, 1.5), (1.8, 9.0)], [SAME, OTHER]), [0, 1])
+    assert found is not None and estimator.worlds[1].scale == pytest.approx(SCALE / OTHER.scale, rel=0.02)
 
 
 def test_a_world_that_comes_again_has_the_similarity_of_its_newest_part() -> None:
@@ -331,6 +389,19 @@ def test_a_world_that_comes_again_has_the_similarity_of_its_newest_part() -> Non
     assert np.linalg.norm(estimator.worlds[0].points(recording.position[last]) - camera) < 0.02
 
 
+def test_an_earlier_world_follows_a_correction_of_its_own() -> None:
+    recording = record(11, seconds=14.0)
+    estimator, _ = drive(recording, until=7.0)
+    estimator.add(recording.samples.between(estimator.stream.end, 13.0))
+    estimator.update(parts(recording, [(0.0, 6.0), (6.5, 12.5)], [SAME, OTHER]), [0, 4])
+    before = dict(estimator.worlds)
+    change = Similarity(1.3, so3_exp(np.array([0.02, -0.01, 0.03])), np.array([0.6, -0.4, 0.2]))
+    estimator.corrected(0, 0, change, 5.5)
+    point = recording.position[100]
+    np.testing.assert_allclose(estimator.worlds[0].points(change.points(point)), before[0].points(point), atol=1e-9)
+    assert estimator.worlds[4] == before[4]
+
+
 def test_the_newest_poses_keep_their_place_after_a_loop_and_in_the_estimates_that_follow() -> None:
     """A loop moves keyframes the further the later they are, into another unit; the oldest node stays where it was."""
     recording, end = record(21, seconds=14.0), 10.5
@@ -344,9 +415,7 @@ def test_the_newest_poses_keep_their_place_after_a_loop_and_in_the_estimates_tha
     for until in (11.0, 13.5):
         for estimator, shown in ((plain, recording), (moved, after)):
             for time in shown.times[(shown.times > estimator.stream.end) & (shown.times <= until)]:
-                estimator.add(shown.samples.between(estimator.stream.end, time))
-                if estimator.due(time):
-                    estimator.update(shown.nodes(time - 20.0, time), [0])
+                feed(estimator, shown, time)
         last = int(np.searchsorted(recording.times, until + 1e-6)) - 1
         expected, found = (e.worlds[0].points(r.position[last]) for e, r in ((plain, recording), (moved, after)))
         assert np.linalg.norm(found - expected) < (1e-9 if until == 11.0 else 0.05)

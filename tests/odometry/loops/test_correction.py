@@ -46,7 +46,7 @@ def test_keyframes_that_were_archived_meanwhile_move_with_the_last_before_them(w
     known = kept[:-2]
     identifiers, found = correction.solve(graph, known, [loop], loop)
     before = graph.poses_cw(np.array(kept))
-    units = correction.apply(graph, kept, loop, identifiers, found)
+    units = correction.apply(graph, kept, loop, identifiers, found).units
     assert list(units) == kept and [units[k] for k in known] == found[:, 7].tolist()
     after, last = graph.poses_cw(np.array(kept)), len(known) - 1
     for row, k in enumerate(kept):
@@ -59,14 +59,14 @@ def test_keyframes_that_were_archived_meanwhile_move_with_the_last_before_them(w
 
 def test_a_correction_of_the_window_is_told(walk):
     graph, kept = walk
-    loop, told = loop_of(graph, kept, 0, 7), []
+    loop = loop_of(graph, kept, 0, 7)
     last = np.array(kept[-1:])
     before = sim3.from_se3(graph.poses_cw(last))
-    correction.apply(graph, kept, loop, *correction.solve(graph, kept, [loop], loop), lambda *what: told.append(what))
-    ((present, change, time),) = told
-    assert present == graph.world_of(graph.segment) and time == graph.archive[kept[-1]].timestamp
-    moved = sim3.compose(before, sim3.inverse(change[None]))
+    (told,) = correction.apply(graph, kept, loop, *correction.solve(graph, kept, [loop], loop)).worlds
+    assert told.window and told.world == graph.world_of(graph.segment)
+    assert told.time == graph.archive[kept[-1]].timestamp
+    moved = sim3.compose(before, sim3.inverse(told.change[None]))
     expected = graph.poses_cw(last)
-    assert float(change[7]) != 1
+    assert float(told.change[7]) != 1
     torch.testing.assert_close(moved[:, :3] / moved[:, 7:], expected[:, :3], rtol=0, atol=1e-6)
     torch.testing.assert_close(moved[:, 3:7], expected[:, 3:7], rtol=0, atol=1e-6)

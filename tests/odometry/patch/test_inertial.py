@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+import torch
 
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.inertial import ImuNoise, InertialSamples
-from dvo.geometry.poses import so3_exp, split
+from dvo.geometry import sim3
+from dvo.geometry.poses import rotation_vector, so3_exp, split
+from dvo.odometry.global_ba.graph_adjustment import Adjusted
 from dvo.odometry.inertial.estimator import Similarity
 from dvo.odometry.inertial.smoother import GRAVITY, Similarities, Smoothed
 from dvo.odometry.patch.inertial import _led, _runs, _spaced
@@ -44,8 +48,8 @@ def align(odometry: PatchOdometry, time: float) -> None:
     rows, zero = np.zeros((1, 3)), np.zeros((1, 3))
     covariance = 1e-6 * np.eye(19 + 8)
     estimator.solution = Smoothed(
-        np.array([time]), UPRIGHT[None], rows, SPEED[None], zero, zero, np.log([2.0]), worlds, 0.0, np.eye(3),
-        np.zeros(3), 1.0, covariance, 0.0, 0.0, np.zeros(2),
+        np.array([time]), np.zeros(1, int), UPRIGHT[None], rows, SPEED[None], zero, zero, np.log([2.0]), worlds, 0.0,
+        np.eye(3), np.zeros(3), 1.0, covariance, 0.0, 0.0, np.zeros(2),
     )  # fmt: skip
     estimator.update = lambda nodes, worlds: None  # type: ignore[method-assign]
     estimator.settle = lambda nodes, worlds: estimator.solution  # type: ignore[method-assign]
@@ -162,6 +166,31 @@ def test_a_world_that_is_not_there_any_more_moves_nothing() -> None:
     twice.graph.worlds[5] = 0  # joined by a loop since
     expected, result = once.finish(), twice.finish()
     np.testing.assert_allclose(result.trajectory.poses_wc, expected.trajectory.poses_wc, atol=1e-9)
+
+
+@pytest.mark.long
+def test_poses_in_metres_keep_their_place_when_an_adjustment_moves_the_map() -> None:
+    """Into another unit and other axes, beside tracking: the next poses are those without it."""
+    change = sim3.exp(torch.tensor([0.5, -0.3, 0.2, 0.1, -0.2, 0.3, 0.4], dtype=torch.float64))
+    expected, found = tracker(), tracker()
+    for odometry in (expected, found):
+        for k, frame in enumerate(with_samples(frames(14))):
+            odometry.track(frame)
+            if k == 9:
+                align(odometry, frame.timestamp)
+    graph, loops = found.graph, found.loops
+    kept = np.array([frame.identifier for frame in graph.archive if frame.anchor is None])
+    moved = sim3.compose(sim3.from_se3(graph.poses_cw(kept)), sim3.inverse(change))
+    depths = np.stack([graph.archive[k].inverse_depth for k in kept.tolist()]) * moved[:, 7:].numpy()
+    adjusted = Adjusted(kept, moved, depths.astype(np.float32), 1, 1.0, 0.5, 0.0)
+    assert loops.adjuster is not None
+    apply = partial(loops.adjuster.take, world=0, cause="request", begun=0.0)
+    loops.maintenance.job = loops.maintenance.beside("adjustment", lambda: adjusted, apply, 0)
+    here, there = (odometry.track(with_samples(frames(15))[14]) for odometry in (expected, found))
+    assert loops.adjuster.records and here.pose_wc is not None and there.pose_wc is not None
+    assert found.inertial.estimator.worlds[0].scale == pytest.approx(2.0 / float(change[7]))
+    np.testing.assert_allclose(there.pose_wc[:3], here.pose_wc[:3], atol=0.02)
+    assert np.linalg.norm(rotation_vector(split(there.pose_wc)[0].T @ split(here.pose_wc)[0])) < 0.01
 
 
 def test_darkness_that_lasts_is_lost() -> None:

@@ -175,7 +175,7 @@ def open_source(
         masks = open_masks(locate(mask, path, "mask"), recording, size, mask_invert, reduction)
     truth = recording.groundtruth
     if request.groundtruth is not None:
-        truth = read_groundtruth(request.groundtruth, recording.timestamps)
+        truth = read_groundtruth(request.groundtruth, recording.timestamps, doubts)
     inertial, told = choose_inertial(recording, imu, request, first.timestamp)
     doubts += told
     try:

@@ -61,7 +61,7 @@ def _is_empty(one: dict[str, Any]) -> bool:
 
 def _calibration(one: dict[str, Any], path: Path) -> Calibration:
     kind = one.get("cameraType", 0)
-    if kind not in _KINDS:
+    if not isinstance(kind, int) or kind not in _KINDS:
         remedy = "give a camera of type 0 (perspective) or 1 (fisheye)"
         raise DvoError(f"cameras of type {str(kind)[:20]} are not known", file=path, field="cameraType", remedy=remedy)
     values = {"K": one.get("intrinsicMatrix"), "model": _KINDS[kind], "coefficients": one.get("distortionCoeff")}

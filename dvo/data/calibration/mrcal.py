@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,9 @@ def mrcal_calibration(path: Path, text: str) -> Calibration:
         DvoError: no dictionary, another lens model, or another number of values than it has.
     """
     try:
-        entries = ast.literal_eval(text)
+        with warnings.catch_warnings():  # of Python, about numbers that run into words
+            warnings.simplefilter("ignore")
+            entries = ast.literal_eval(text)
     except (ValueError, SyntaxError, MemoryError, RecursionError, TypeError):
         entries = None
     if not isinstance(entries, dict):

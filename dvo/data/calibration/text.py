@@ -49,9 +49,8 @@ def from_text(text: str, path: Path) -> Calibration:
         return from_matrix(np.array(rows), path)
     if lengths in ([9], [12], [16]) and _is_matrix(rows[0]):
         return from_matrix(np.array(rows[0]).reshape(3 if lengths[0] < 16 else 4, -1), path)
-    size: dict[str, int] = {}
     if path.suffix.lower() == ".pincam" and lengths == [6]:  # ARKitScenes
-        size, rows = dict(zip(("width", "height"), map(int, rows[0][:2]), strict=True)), [rows[0][2:]]
+        return from_values({"intrinsics": rows[0][2:], "resolution": rows[0][:2]}, path)
     if len(rows) != 1 or len(rows[0]) not in (4, 8, 9, 12):
         counts = " + ".join(str(len(row)) for row in rows[:10]) or "no"
         raise DvoError(
@@ -59,7 +58,7 @@ def from_text(text: str, path: Path) -> Calibration:
         )
     fx, fy, cx, cy, *coefficients = rows[0]
     model: DistortionModel = "radtan" if any(coefficients) else "none"
-    return Calibration(fx, fy, cx, cy, model, tuple(coefficients) if model == "radtan" else (), file=path, **size)
+    return Calibration(fx, fy, cx, cy, model, tuple(coefficients) if model == "radtan" else (), file=path)
 
 
 def _fields(line: str, path: Path) -> list[str]:

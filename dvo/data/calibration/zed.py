@@ -61,7 +61,7 @@ def zed_calibration(path: Path, text: str, camera: int | None) -> Calibration:
 
 def _calibration(name: str, sections: dict[str, dict[str, float]], path: Path) -> Calibration:
     values = dict(sections[name])
-    side, kind = name.split("_CAM_")
+    side, _, kind = name.partition("_CAM_")
     own = {key: values.pop(key) for key in _COEFFICIENTS if key in values}
     shared = sections.get(f"{side}_DISTO", {})
     lens = [(shared if any(shared.values()) else own).get(key, 0.0) for key in _COEFFICIENTS]

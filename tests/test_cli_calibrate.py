@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -83,6 +84,36 @@ def test_bad_input_is_one_line(options, match, folder, tmp_path, capsys):
     said = capsys.readouterr().err
     assert match in said and "Traceback" not in said
     assert not out.exists()
+
+
+def test_a_part_of_a_recording(folder, tmp_path, capsys):
+    """The options of ``dvo run`` about its images: twenty frames, two a second, every other from 1 to 7.5 s."""
+    for index in range(10, 20):
+        shutil.copy(folder / f"{index - 10}.png", folder / f"{index}.png")
+    out = tmp_path / "out"
+    line = ["calibrate", str(folder), "--board", "5x4", "--out", str(out)]
+    assert main([*line, "--fps", "2", "--start", "1", "--end", "7.5", "--stride", "2"]) == 0
+    facts = json.loads((out / "calibration.json").read_text())
+    assert facts["examined"] == 7
+    assert {view["frame"] for view in facts["views"]} <= {2, 4, 6, 8, 10, 12, 14}
+
+
+def test_a_part_without_a_board(folder, tmp_path, capsys, monkeypatch):
+    def calibrate(frames, **options):
+        assert [frame.index for frame in frames] == [3, 5, 7]
+        assert all(frame.mask is not None and not frame.mask[:40].any() and frame.mask[41:].all() for frame in frames)
+        return SelfCalibration(201.0, 4.5, "self-calibration", 240, 180, 3, "", guess_from_angle(240, 180))
+
+    monkeypatch.setattr(command, "self_calibrate", calibrate)
+    cv2.imwrite(str(tmp_path / "mask.png"), np.repeat([0] * 40 + [255] * 140, 240).reshape(180, 240).astype(np.uint8))
+    line = ["calibrate", str(folder), "--out", str(tmp_path / "out"), "--mask", str(tmp_path / "mask.png")]
+    assert main([*line, "--fps", "10", "--start", "3f", "--end", "0.8", "--stride", "2"]) == 0
+
+
+@pytest.mark.parametrize("option", [("--mask", "m.png"), ("--max-pixels", "9000")])
+def test_a_board_is_searched_in_whole_images(option, folder, tmp_path, capsys):
+    assert main(["calibrate", str(folder), "--board", "5x4", *option, "--out", str(tmp_path / "out")]) == 2
+    assert f"{option[0]}: a board is searched in whole images" in capsys.readouterr().err
 
 
 def test_streams_are_refused(capsys):

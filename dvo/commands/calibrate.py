@@ -16,12 +16,12 @@ from dvo.boards.board import Board, CharucoBoard, Checkerboard
 from dvo.boards.calibrate import HEADER, BoardCalibration, BoardOptions, calibrate_board
 from dvo.commands import NOTHING_TRACKED, OK
 from dvo.commands.console import StderrConsole, TrackingProgress, device_of, say, say_all, seed_everything, warn
+from dvo.commands.input_options import source_settings
 from dvo.commands.places import check_outputs
 from dvo.core.errors import DvoError
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.files import is_file
 from dvo.data.files.output import replaced, write_text
-from dvo.data.images.reduction import MAX_PIXELS
 from dvo.data.source import Source
 from dvo.data.streams.capture import is_stream
 from dvo.geometry.lenses import LENSES
@@ -58,9 +58,16 @@ def calibrate(arguments: argparse.Namespace) -> int:
     options = BoardOptions(fisheye=arguments.fisheye, k3=arguments.k3, frames=arguments.frames)
     if board is None and (arguments.fisheye or arguments.k3):
         raise DvoError("needs a board", field="--fisheye" if arguments.fisheye else "--k3", remedy="give --board CxR")
-    fps = None if board is None else 30.0  # of views of a board, the times do not matter
-    limit = MAX_PIXELS if board is None else None  # corners are found in the images as recorded
-    source = dvo.open(arguments.source, guess=True, undistort=False, fps=fps, max_pixels=limit)
+    settings = source_settings(arguments)
+    if board is not None:
+        for name in ("mask", "max_pixels"):
+            if getattr(arguments, name) is not None:
+                message, field = "a board is searched in whole images, as recorded", f"--{name.replace('_', '-')}"
+                raise DvoError(message, field=field, remedy="leave it out")
+        settings["max_pixels"] = None
+        if all(settings[name] is None for name in ("times", "fps", "start", "end")):
+            settings["fps"] = 30.0  # times do not matter unless something asks for them
+    source = dvo.open(arguments.source, guess=True, undistort=False, stride=arguments.stride, **settings)
     for warning in source.warnings:
         warn(warning, "note")
     file = FISHEYE if options.fisheye else results.CALIBRATION
@@ -69,6 +76,7 @@ def calibrate(arguments: argparse.Namespace) -> int:
         taken = [name for name in names if os.path.lexists(folder / name)]
         results.check_free(folder, taken, names if _is_ours(folder / file) else (), arguments.overwrite)
         inputs = {"--weights": arguments.weights} if board is None else {}
+        inputs |= {"--times": arguments.times, "--mask": arguments.mask}
         check_outputs({"--out": folder / file}, inputs, arguments.source)
         if board is None:
             return _without_board(source, folder, arguments)

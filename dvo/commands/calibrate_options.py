@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from dvo.commands.input_options import add_source_options
 from dvo.core.command_line import number, whole
 
 _CODES = "exit codes: 0 done, 1 the motion does not tell the focal length (without a board), 2 bad input"
@@ -43,6 +44,7 @@ def add_calibrate(commands: Any) -> None:
     parser.add_argument(
         "--frames", type=whole, default=300, metavar="N", help="frames to search (default: %(default)s)"
     )
+    add_source_options(parser)
     parser.add_argument("--out", metavar="DIR", help="results folder (default: runs/NAME-TIME)")
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier calibration in --out")
     parser.add_argument("--weights", metavar="NAME|FILE", default="small", help="without a board (default: small)")

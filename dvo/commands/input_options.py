@@ -1,4 +1,4 @@
-"""Options of ``dvo run`` about its input, in a module that imports nothing heavy."""
+"""Options about the input of a command, in a module that imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -7,17 +7,27 @@ import contextlib
 from dataclasses import asdict
 from typing import Any
 
-from dvo.core.command_line import whole
+from dvo.core.command_line import positive_float, positive_int, whole
 
 
-def add_input_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options.
+def add_source_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options about the images of a source and their times, of every command that opens one.
 
     Args:
         parser: of the command.
     """
+    parser.add_argument("--stride", type=positive_int, default=1, metavar="N", help="take every N-th frame")
+    times = parser.add_mutually_exclusive_group()
+    times.add_argument(
+        "--times",
+        metavar="FILE",
+        help="file with the time of each image, in any unit (a header such as 'time [ms]' names it)",
+    )
+    times.add_argument(
+        "--fps", type=positive_float, metavar="F", help="frames per second, if the source does not define it"
+    )
     parser.add_argument(
-        "--start", metavar="T", help="first frame to track: seconds since the first frame, or its number, such as 120f"
+        "--start", metavar="T", help="first frame to take: seconds since the first frame, or its number, such as 120f"
     )
     parser.add_argument("--end", metavar="T", help="frame to stop before, in the same form; also of a stream")
     parser.add_argument(
@@ -32,13 +42,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
         type=whole,
         help="images with more pixels are reduced when they are read (4000000); 0: never",
     )
-    parser.add_argument(
-        "--extrinsics",
-        metavar="FILE",
-        help="pose of the camera in a base frame, 4x4 matrix or 'x y z qx qy qz qw': writes trajectory_base.txt too",
-    )
     parser.add_argument("--topic", metavar="NAME", help="topic of the images in a bag of ROS 1 or 2, or an MCAP file")
-    add_inertial_options(parser)
 
 
 def add_inertial_options(parser: argparse.ArgumentParser) -> None:
@@ -62,16 +66,25 @@ def add_inertial_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--imu-topic", metavar="NAME", help="topic of inertial samples in a bag, if there are several")
 
 
-def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Arguments of :func:`dvo.open` for the options.
+def source_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of :func:`dvo.open` for the options of :func:`add_source_options`, the stride aside.
 
     Args:
         arguments: of the command line.
     """
-    masks = {"mask": arguments.mask, "mask_invert": arguments.mask_invert}
+    names = ("times", "fps", "start", "end", "mask", "mask_invert", "topic")
     pixels = {} if arguments.max_pixels is None else {"max_pixels": arguments.max_pixels or None}
+    return {name: getattr(arguments, name) for name in names} | pixels
+
+
+def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of :func:`dvo.open` for the options of ``dvo run`` about its input, the stride aside.
+
+    Args:
+        arguments: of the command line.
+    """
     inertial = {"imu": arguments.imu, "imu_calib": arguments.imu_calib, "imu_topic": arguments.imu_topic}
-    return {"start": arguments.start, "end": arguments.end, **masks, **pixels, **inertial}
+    return source_settings(arguments) | inertial
 
 
 def print_input(source: Any) -> None:

@@ -28,7 +28,7 @@ from dvo.commands.report import Scores, describe_seconds, headline, print_report
 from dvo.commands.request import request_facts
 from dvo.commands.run_options import INPUTS
 from dvo.commands.scale import scale_observers, scale_settings, scaled_source
-from dvo.commands.streams import print_counts, stream_facts, stream_settings
+from dvo.commands.streams import print_counts, stream_facts
 from dvo.commands.summary import Pages
 from dvo.core.errors import DvoError
 from dvo.core.settings import parse_settings, read_settings
@@ -98,11 +98,9 @@ def run(arguments: argparse.Namespace) -> int:
     source = dvo.open(
         arguments.source,
         calib=arguments.calib,
-        times=arguments.times,
-        fps=arguments.fps,
         groundtruth=arguments.groundtruth,
         guess=True,
-        **stream_settings(arguments),
+        queue=arguments.queue,
         **input_settings(arguments),
     )
     source = scaled_source(source, arguments)

@@ -6,10 +6,10 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-from dvo.commands.input_options import add_input_options
+from dvo.commands.input_options import add_inertial_options, add_source_options
 from dvo.commands.scale_options import add_scale_options
 from dvo.commands.view_options import add_view_options
-from dvo.core.command_line import names, positive_float, positive_int, seed
+from dvo.core.command_line import names, positive_int, seed
 
 INPUTS = (
     "calib", "times", "groundtruth", "extrinsics", "mask", "depth", "right", "depth_calib", "config", "map", "weights",
@@ -92,16 +92,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
         "a data set, else the focal length is found in the images)",
     )
     add_tracking_options(parser)
-    parser.add_argument("--stride", type=positive_int, default=1, metavar="N", help="track every N-th frame")
-    times = parser.add_mutually_exclusive_group()
-    times.add_argument(
-        "--times",
-        metavar="FILE",
-        help="file with the time of each image, in any unit (a header such as 'time [ms]' names it)",
-    )
-    times.add_argument(
-        "--fps", type=positive_float, metavar="F", help="frames per second, if the source does not define it"
-    )
+    add_source_options(parser)
     parser.add_argument("--groundtruth", metavar="FILE", help="TUM trajectory (camera to world) to compare with")
     parser.add_argument(
         "--export",
@@ -113,7 +104,12 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     add_image_options(parser)
     parser.add_argument("--save-map", metavar="FILE", help="map file (.dvo) to write at the end, for a later --map")
     parser.add_argument("--map", metavar="FILE", help="map file (.dvo) of an earlier recording, to be localised in")
-    add_input_options(parser)
+    parser.add_argument(
+        "--extrinsics",
+        metavar="FILE",
+        help="pose of the camera in a base frame, 4x4 matrix or 'x y z qx qy qz qw': writes trajectory_base.txt too",
+    )
+    add_inertial_options(parser)
     add_view_options(parser)
     add_scale_options(parser)
 

@@ -1,23 +1,13 @@
-"""Streams in ``dvo run``: settings from the command line, and the counts of their frames."""
+"""Streams in ``dvo run``: the counts of their frames."""
 
 from __future__ import annotations
 
-import argparse
 import time
 from typing import Any
 
 from dvo.commands.console import say
 from dvo.data.source import Source
 from dvo.data.streams.live_source import LiveSource
-
-
-def stream_settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Arguments of :func:`dvo.open` for a stream, or a bag of ROS.
-
-    Args:
-        arguments: of the command line.
-    """
-    return {"queue": arguments.queue, "topic": arguments.topic}
 
 
 def stream_facts(source: Source) -> dict[str, Any]:

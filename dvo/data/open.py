@@ -10,6 +10,7 @@ from typing import Any
 
 from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
+from dvo.core.text import visible
 from dvo.data.calibration.calibration import Calibration
 from dvo.data.calibration.focal_guess import guess_focal
 from dvo.data.calibration.read import read_calibration
@@ -18,6 +19,7 @@ from dvo.data.files.files import lookups
 from dvo.data.files.stamps import checked_rate
 from dvo.data.images.fields import INTERLACED, are_interlaced
 from dvo.data.images.halves import two_views
+from dvo.data.images.image_header import holds_several
 from dvo.data.images.reduction import MAX_PIXELS, reduction_to
 from dvo.data.inertial_files.imu_calibration import ImuCalibration
 from dvo.data.interval import Bound, Interval, expected_frames
@@ -167,6 +169,10 @@ def open_source(
             f"the halves of the images look alike, {halves}: if this is stereo, track one of them "
             f"(ffmpeg -vf crop={part})"
         )
+    if recording.images and holds_several(recording.images[0]):
+        doubts.append(
+            f"{visible(recording.images[0].name)} holds several images, of which the first is read: take them apart"
+        )
     if recording.kind in ("folder", "rosbag") and are_interlaced(raw.image for raw in recording.frames(Log())):
         doubts.append(INTERLACED)
     reduction = reduction_to(max_pixels, width, height)
@@ -175,7 +181,7 @@ def open_source(
         masks = open_masks(locate(mask, path, "mask"), recording, size, mask_invert, reduction)
     truth = recording.groundtruth
     if request.groundtruth is not None:
-        truth = read_groundtruth(request.groundtruth, recording.timestamps)
+        truth = read_groundtruth(request.groundtruth, recording.timestamps, doubts)
     inertial, told = choose_inertial(recording, imu, request, first.timestamp)
     doubts += told
     try:

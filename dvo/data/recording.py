@@ -15,7 +15,7 @@ from dvo.core.errors import DvoError
 from dvo.core.text import visible
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.files.files import exists
-from dvo.data.images.images import converted, decode, read_image, used_bits
+from dvo.data.images.images import converted, decode, few_bits, read_image, used_bits
 from dvo.data.images.orientation import check_zoom, common_orientation, turn
 from dvo.data.images.reduction import Reduction
 from dvo.data.inertial import InertialSamples
@@ -325,8 +325,7 @@ class ImageRecording:
             return 16
         bits = used_bits(decode(self.images[index]) for index in some)
         if bits < 16:
-            factor = 2 ** (bits - 8)
-            self.warnings.append(f"the images of 16 bits hold {bits} bits: they are divided by {factor}, not by 257")
+            self.warnings.append(few_bits(bits))
         return bits
 
     def _look_through(self, decoded: np.ndarray) -> None:

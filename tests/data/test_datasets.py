@@ -250,7 +250,10 @@ def test_sequence_folder(make):
     source = open_source(make.root / "clip")
     assert (source.kind, source.name, source.camera.fx) == ("sequence", "clip", 50)
     assert [frame.timestamp for frame in source] == [0, 0.5, 0.9]  # those of the ground truth, row by row
-    assert source.groundtruth.path_length == 2 and source.warnings == []
+    assert source.groundtruth.path_length == 2
+    assert (
+        len(source.warnings) == 1 and f"beside it are depth (--depth {make.root / 'clip/depth'})" in source.warnings[0]
+    )
     (make.root / "clip/groundtruth_tum.txt").unlink()
     assert any("assuming 30" in warning for warning in open_source(make.root / "clip").warnings)
 

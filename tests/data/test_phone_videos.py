@@ -161,6 +161,13 @@ def test_turned(tmp_path, clockwise):
     assert max(differences(frames, [np.rot90(image, -clockwise // 90) for image in PICTURES])) < 3
 
 
+def test_a_mirrored_video_is_told(tmp_path):
+    plain, file = encode(tmp_path / "v.mp4", *FORMS["h264.mp4"]), tmp_path / "mirrored.mp4"
+    assert open_source(plain, calib=CALIB).warnings == []
+    ffmpeg("-display_vflip", "-i", plain, "-c", "copy", file)
+    assert ["mirrored" in warning for warning in open_source(file, calib=CALIB).warnings] == [True]
+
+
 def test_trimmed_videos_are_whole_and_cut_ones_are_not(tmp_path):
     pictures = [picture(index % 20) for index in range(60)]
     options = ("-c:v", "libx264", "-g", 60, "-pix_fmt", "yuv420p", "-movflags", "faststart")

@@ -88,13 +88,25 @@ def load_xml(text: str, path: Path) -> Any:
     Raises:
         DvoError: not valid XML, one with entities of its own, or nested too deeply.
     """
+    return _value(xml_root(text, path), path, 0)
+
+
+def xml_root(text: str, path: Path) -> ElementTree.Element:
+    """Root element of XML.
+
+    Args:
+        text: of the file.
+        path: file that it comes from, for messages.
+
+    Raises:
+        DvoError: not valid XML, or one with entities of its own.
+    """
     if "<!" in re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL):
         raise DvoError("XML with declarations", file=path, field="calibration", remedy=EXPECTED)
     try:
-        root = ElementTree.fromstring(text)
+        return ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         raise DvoError(f"not valid XML ({error})", file=path, field="calibration", remedy=EXPECTED) from None
-    return _value(root, path, 0)
 
 
 def _value(element: Any, path: Path, depth: int) -> Any:

@@ -67,7 +67,7 @@ _KIND = re.compile(
     r"radial.?tangential|radtan|cubemap|catadioptric)"
 )
 _OTHER = re.compile(  # keys that speak of something else though they have such a word
-    r"(polymorph|undist|rectif|error|flag|name|file|path|topic|mask|serial|facing|distance|iter|thresh|min_|max_|uncert|std|stdev|"
+    r"(polymorph|per_frame|undist|rectif|error|flag|name|file|path|topic|mask|serial|facing|distance|iter|thresh|min_|max_|uncert|std|stdev|"
     r"covar|sigma|weight|optical_?flow|optimi|criteria|aspect|rms|imu|gyro|acc)"
 )
 _BENIGN = re.compile(  # lists of as many numbers as a lens may have coefficients

@@ -29,6 +29,10 @@ _BUILT_IN = {
     "matlab": "dvo.data.calibration.matlab:DIALECT",
     "middlebury": "dvo.data.calibration.middlebury:DIALECT",
     "realsense": "dvo.data.calibration.realsense:DIALECT",
+    "depthai": "dvo.data.calibration.depthai:DIALECT",
+    "zed": "dvo.data.calibration.zed:DIALECT",
+    "mrcal": "dvo.data.calibration.mrcal:DIALECT",
+    "metashape": "dvo.data.calibration.metashape:DIALECT",
     "ost": "dvo.data.calibration.values:OST",
     "xml": "dvo.data.calibration.values:XML",
     "json": "dvo.data.calibration.values:JSON",
@@ -39,7 +43,8 @@ DIALECTS = Registry("calibration dialect", "dvo.calibration_dialects", dict(_BUI
 """Names to ``"module:DIALECT"``, each a :class:`dvo.data.calibration.calibration.Dialect`. Those of other packages come
 first, because ``text`` takes any file."""
 _NUMBERED = frozenset(["numpy", "colmap", "kitti raw", "meshroom", "openmvg", "matlab", "middlebury", "realsense",
-                       "json", "yaml", "xml"])  # that may have several cameras  # fmt: skip
+                       "depthai", "zed", "metashape", "json", "yaml", "xml"])  # fmt: skip
+"""Those that may have several cameras."""
 SHORTEST = 0.01
 """Focal length at least, widths of the images: below it, it is no number of pixels."""
 _UNSTATED = 100

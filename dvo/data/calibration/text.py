@@ -49,6 +49,8 @@ def from_text(text: str, path: Path) -> Calibration:
         return from_matrix(np.array(rows), path)
     if lengths in ([9], [12], [16]) and _is_matrix(rows[0]):
         return from_matrix(np.array(rows[0]).reshape(3 if lengths[0] < 16 else 4, -1), path)
+    if path.suffix.lower() == ".pincam" and lengths == [6]:  # ARKitScenes
+        return from_values({"intrinsics": rows[0][2:], "resolution": rows[0][:2]}, path)
     if len(rows) != 1 or len(rows[0]) not in (4, 8, 9, 12):
         counts = " + ".join(str(len(row)) for row in rows[:10]) or "no"
         raise DvoError(

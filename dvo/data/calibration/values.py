@@ -16,7 +16,7 @@ from dvo.data.calibration.calibration import EXPECTED, Calibration, Dialect
 from dvo.data.calibration.colmap_cameras import CORNER
 from dvo.data.calibration.documents import is_ost, load_documents, load_json, load_ost, load_xml
 from dvo.data.calibration.entries import Entries
-from dvo.data.calibration.lens_names import PINHOLE, bare, is_flag, model_of, says_nothing
+from dvo.data.calibration.lens_names import PINHOLE, bare, is_flag, looks_like_a_lens, model_of, says_nothing
 from dvo.geometry.camera import DistortionModel
 from dvo.geometry.lenses import LENSES
 
@@ -110,8 +110,8 @@ def from_values(data: Any, path: Path, camera: int | None = None) -> Calibration
     if not read:
         raise DvoError(_missing(mappings), file=path, field="intrinsics", remedy=EXPECTED)
     if any(other != read[0] for other in read[1:]):
-        message = f"{len(read)} documents with different cameras in it"
-        raise DvoError(message, file=path, field="intrinsics", remedy="leave one of them")
+        message = f"a list of {len(read)} cameras that differ"
+        raise DvoError(message, file=path, field="intrinsics", remedy="leave that of the images in it")
     return read[0]
 
 
@@ -372,6 +372,8 @@ def _model(entries: Entries, path: Path) -> DistortionModel | None:
                 continue
             if key in ("lens", "distortion", "projection") and not isinstance(entry.value, str):
                 continue
+            if isinstance(entry.value, int | float) and not _has_lens(entries):
+                continue  # Record3D: which of the phone's cameras
             model = model_of(entry.value)
             if model is None and bare(str(entry.value)).removeprefix("distortion") in _IF_ZERO:
                 lists = [one.value for one in entries.found if set(_COEFFICIENTS) & set(one.calls)]
@@ -411,6 +413,14 @@ def _model(entries: Entries, path: Path) -> DistortionModel | None:
         told = " and ".join([*(f"{model} ({key})" for model, key in named.items()), *([pinhole] if pinhole else [])])
         raise DvoError(f"two lens models: {told}", file=path, field="model", remedy="leave the one of the camera")
     return next(iter(named), None)  # type: ignore[arg-type]
+
+
+def _has_lens(entries: Entries) -> bool:
+    """True if something but the name of a model speaks of a lens."""
+    return any(
+        looks_like_a_lens(entry.key, entry.value) for entry in entries.found
+        if not set(_MODEL_KEYS) & set(entry.calls)
+    )  # fmt: skip
 
 
 def _lens(entries: Entries, before: list[float], path: Path) -> tuple[DistortionModel, tuple[float, ...]]:

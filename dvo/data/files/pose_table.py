@@ -11,7 +11,7 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.data.files.clock import PARTS, Clock, in_seconds, named_times, parse_time, read_table, unit_of
-from dvo.data.files.files import MAX_NUMBER, parse_number
+from dvo.data.files.files import MAX_NUMBER, parse_number, read_lines
 from dvo.geometry.poses import poses_from_matrices
 
 HEADER = "timestamp tx ty tz qx qy qz qw"
@@ -42,6 +42,10 @@ class _Columns:
 _TUM = _Columns(0, None, tuple(range(1, _NUMBERS)))
 _EUROC = _Columns(0, "ns", (1, 2, 3, 5, 6, 7, 4))  # state_groundtruth_estimate0/data.csv: velocity and biases follow
 _EUROC_NUMBERS = 17
+_JOINED = re.compile(  # before an axis: "posx"
+    r"(?:pos|position|trans|translation|loc|location|tvec|coord|point|center|centre|gt|est|world|cam|camera|quat|"
+    r"quaternion|rot|rotation|orient|orientation)$"
+)
 _OF_CAMERA = re.compile(r"(?:^|[^a-z])[tqrp]?_?(?:cw|c_w|w2c)(?:[^a-z]|$)")  # T_cw
 _RIGID = 0.02  # largest deviation of a rotation from an orthogonal matrix
 _MATRIX = {13: 12, 17: 16}  # numbers of a row of a time and a matrix, and of the matrix
@@ -82,6 +86,10 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
     if columns is None and _are_matrices(table.rows):
         table = replace(table, rows=[_of_matrix(fields) for fields in table.rows])
         width = _NUMBERS
+    if columns is None and width == _NUMBERS and _ends_in_comma(path, table.lines[0]):
+        message = "8 numbers without a header, and a comma behind them, as VINS writes poses with q_w before q_x"
+        remedy = "write timestamp,tx,ty,tz,qw,qx,qy,qz as the first line, or the order that they have"
+        raise DvoError(message, file=path, field=f"line {table.lines[0]}", remedy=remedy)
     columns = columns or (_EUROC if width == _EUROC_NUMBERS else _TUM)
     expected = width if columns is not _TUM else _NUMBERS
     times: list[int | float] = []
@@ -112,6 +120,24 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
         raise _no_row(path, lines[int(beyond[0])])
     values[:, :3] *= columns.length
     return Clock(seconds, unit, columns.time), values, lines
+
+
+def names_a_pose(path: Path) -> bool:
+    """True for a file whose header, a comment too, names a time, a position and a quaternion.
+
+    Args:
+        path: text or CSV file.
+
+    Raises:
+        DvoError: the file cannot be read, or see :func:`read_pose_table`.
+    """
+    header = read_table(path, f"give a file of rows '{HEADER}'").header
+    return header is not None and _named(header, path) is not None
+
+
+def _ends_in_comma(path: Path, number: int) -> bool:
+    lines = read_lines(path, f"give a file of rows '{HEADER}'")
+    return next(line for count, line in lines if count == number).split("#")[0].rstrip().endswith(",")
 
 
 def _are_matrices(rows: Sequence[Sequence[str]]) -> bool:
@@ -172,12 +198,15 @@ def _named(header: Sequence[str], path: Path) -> _Columns | None:
 
 def _part(name: str) -> str | None:
     """Part of a pose that a column holds, such as ``p_RS_R_x``, ``pose.orientation.w`` or ``tz``."""
-    axis = re.fullmatch(r"(.*?)[_. ]?([wxyz])", name)
+    axis = re.fullmatch(r"(.*?)([_. ]?)([wxyz])", name)
     if axis is None:
         return None
     head = axis[1]
+    joined = re.search(r"[a-z]*$", head)
+    if not axis[2] and len(joined[0] if joined else "") > 1 and not _JOINED.search(head):
+        return None  # such as "index"
     words = re.split(r"[^a-z]+", head)
-    if any(word.startswith(("q", "orient", "quat", "rot")) for word in words) or (axis[2] == "w" and not head):
-        return f"q{axis[2]}"
-    is_other = axis[2] == "w" or _OTHERS.fullmatch(words[0]) or {"linear", "angular", "velocity"} & set(words)
-    return None if is_other else f"t{axis[2]}"
+    if any(word.startswith(("q", "orient", "quat", "rot")) for word in words) or (axis[3] == "w" and not head):
+        return f"q{axis[3]}"
+    is_other = axis[3] == "w" or _OTHERS.fullmatch(words[0]) or {"linear", "angular", "velocity"} & set(words)
+    return None if is_other else f"t{axis[3]}"

@@ -69,6 +69,10 @@ class FieldTest:
             self._totals += sums
             self._triples += 1
 
+    def skip(self) -> None:
+        """Images were left out: those before them are compared with none behind them."""
+        self._window = []
+
     @property
     def is_interlaced(self) -> bool:
         """True for interlaced images; False also where nothing has moved yet."""

@@ -11,6 +11,8 @@ MAX_PIXELS = 64_000_000
 """Largest image that is decoded, pixels; 9,200 x 6,900 of a camera with 64 megapixels."""
 
 _SEGMENTS = 4096  # of a JPEG file before its frame header
+_PAGES = 8  # of a TIFF file that are looked at
+_TIFF_HEADS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _TIFF_TYPES = {3: "H", 4: "I", 16: "Q"}
 
 
@@ -32,6 +34,41 @@ def image_size(source: Path | str | bytes) -> tuple[int, int] | None:
         return None
 
 
+def holds_several(source: Path) -> bool:
+    """True for a file of several images: pages of a TIFF, an animated PNG or WebP.
+
+    Args:
+        source: file; what is no such file, or cannot be read, holds one.
+    """
+    try:
+        with source.open("rb") as file:
+            head = file.read(64)
+            if head[:4] in _TIFF_HEADS:
+                return _has_second_page(file, head)
+            return (head.startswith(b"\x89PNG") and b"acTL" in head) or (head[12:16] == b"VP8X" and bool(head[20] & 2))
+    except (OSError, struct.error, ValueError, OverflowError):
+        return False
+
+
+def _has_second_page(file: BinaryIO, head: bytes) -> bool:
+    """True if another directory follows the first one that is no reduced copy or mask of it (tag 254)."""
+    order, big = ("<" if head[:2] == b"II" else ">"), head[2:4] in (b"+\0", b"\0+")
+    offset, counts, entry = (f"{order}Q", f"{order}Q", 20) if big else (f"{order}I", f"{order}H", 12)
+    (at,) = struct.unpack_from(offset, head, 8 if big else 4)
+    for number in range(_PAGES):
+        if at == 0:
+            return False
+        file.seek(at)
+        (count,) = struct.unpack(counts, file.read(struct.calcsize(counts)))
+        rows = file.read(min(count, 1024) * entry)
+        tags = {struct.unpack_from(f"{order}H", rows, k)[0]: rows[k : k + entry] for k in range(0, len(rows), entry)}
+        kind = struct.unpack_from(f"{order}I", tags[254], entry - (8 if big else 4))[0] if 254 in tags else 0
+        if number and not kind & 5:
+            return True
+        (at,) = struct.unpack(offset, file.read(struct.calcsize(offset)))
+    return False
+
+
 def _size(file: BinaryIO) -> tuple[int, int] | None:
     head = file.read(32)
     if head.startswith(b"\x89PNG\r\n\x1a\n"):
@@ -40,7 +77,7 @@ def _size(file: BinaryIO) -> tuple[int, int] | None:
         return _jpeg(file)
     if head.startswith(b"BM"):
         return _bmp(head)
-    if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+    if head[:4] in _TIFF_HEADS:
         return _tiff(file, head)
     if head.startswith(b"RIFF") and head[8:12] == b"WEBP":
         return _webp(head)

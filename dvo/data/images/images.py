@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,16 @@ from dvo.data.images.image_header import MAX_PIXELS, image_size
 from dvo.data.images.orientation import oriented
 from dvo.data.images.reduction import Reduction
 
-SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
+SUFFIXES = frozenset(
+    {".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".bmp", ".dib", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".pnm"}
+)
 
 UNREAD = frozenset(
     {".heic", ".heif", ".avif", ".jxl", ".jp2", ".exr", ".hdr", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf",
      ".rw2", ".gif"}
 )  # fmt: skip
 """Endings of images that are not read: of phones, of cameras, and moving ones."""
+_HEXADECIMAL = re.compile(r"[0-9a-f]+")
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -33,6 +36,18 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     # "²" is a digit to str.isdigit, but no number to int
     key = [(0, int(part), "") if part[0] in "0123456789" else (1, 0, part.lower()) for part in parts if part]
     return [*key, (2, 0, name)]  # 1.png and 01.png have one place, whatever the order of the folder
+
+
+def in_order(files: Sequence[Path]) -> list[Path]:
+    """Files in natural order; hexadecimal numbers of one length (``0009``, ``000a``) in theirs.
+
+    Args:
+        files: of one folder.
+    """
+    stems = {path.stem.lower() for path in files}
+    if len({len(stem) for stem in stems}) == 1 and all(_HEXADECIMAL.fullmatch(stem) for stem in stems):
+        return sorted(files, key=lambda path: (path.stem.lower(), path.name))
+    return sorted(files, key=lambda path: natural_key(path.name))
 
 
 def list_images(folder: Path, warnings: list[str] | None = None) -> list[Path]:
@@ -48,7 +63,7 @@ def list_images(folder: Path, warnings: list[str] | None = None) -> list[Path]:
     if not folder.is_dir():
         return []
     files = [path for path in folder.iterdir() if not path.name.startswith(".")]
-    found = sorted((path for path in files if path.suffix.lower() in SUFFIXES), key=lambda path: natural_key(path.name))
+    found = in_order([path for path in files if path.suffix.lower() in SUFFIXES])
     unread = [] if warnings is None else [path for path in files if path.suffix.lower() in UNREAD]
     if unread and warnings is not None:
         kinds = ", ".join(sorted({path.suffix.lower()[1:].upper() for path in unread}))
@@ -71,16 +86,25 @@ def has_images(folder: Path) -> bool:
 
 
 def used_bits(images: Iterable[np.ndarray | None]) -> int:
-    """Bits that images of 16 bits use: cameras write 10, 12 or 14 of them into the lower ones.
+    """Bits that images of 16 bits use: cameras write 10, 12 or 14 of them into the lower ones, programs 8.
 
     Args:
         images: some of a recording, as decoded; None and others are passed over.
 
     Returns:
-        10, 12, 14 or 16; the fewest that hold every pixel.
+        8, 10, 12, 14 or 16; the fewest that hold every pixel.
     """
     largest = max((int(image.max()) for image in images if image is not None and image.dtype == np.uint16), default=0)
-    return next((bits for bits in (10, 12, 14) if 0 < largest < 2**bits), 16)
+    return next((bits for bits in (8, 10, 12, 14) if 0 < largest < 2**bits), 16)
+
+
+def few_bits(bits: int) -> str:
+    """Note about images of 16 bits that use fewer.
+
+    Args:
+        bits: of :func:`used_bits`.
+    """
+    return f"the images of 16 bits hold {bits} bits: they are divided by {2 ** (bits - 8)}, not by 257"
 
 
 def to_rgb8(image: np.ndarray, bits: int = 16) -> np.ndarray:

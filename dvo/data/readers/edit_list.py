@@ -1,4 +1,4 @@
-"""Edit list of a video in a QuickTime or MP4 container: which part of it is shown, after it was trimmed."""
+"""How a video in a QuickTime or MP4 container is shown: the part of it that is left after trimming, and mirroring."""
 
 from __future__ import annotations
 
@@ -35,6 +35,21 @@ def shown_seconds(file: Path) -> float | None:
     except (OSError, ValueError, IndexError, struct.error):  # cut, or sizes that lead nowhere
         return None
     return None
+
+
+def is_mirrored(file: Path) -> bool:
+    """True for a video whose frames the matrix of its track mirrors, as some front cameras write it.
+
+    Args:
+        file: a video; False of another container.
+    """
+    try:
+        tracks = (track for kind, track in boxes(_index(file) or b"") if kind == b"trak" and _is_video(track))
+        head = next((dict(boxes(track)).get(b"tkhd", b"") for track in tracks), b"")
+        a, b, _, c, d = struct.unpack_from(">5i", head, 52 if head[0] else 40)
+    except (OSError, ValueError, IndexError, struct.error):
+        return False
+    return a * d - b * c < 0
 
 
 def _index(file: Path) -> bytes | None:

@@ -84,7 +84,7 @@ def times_of_rows(request: Request, count: int, warnings: list[str]) -> np.ndarr
         times = read_tum(file).timestamps
     except DvoError:  # of another format, or malformed: that is told when it is read for its poses
         return None
-    if len(times) != count:
+    if len(times) != count or (count > 2 and (np.diff(times) == 1).all()):  # numbers of frames are no times
         return None
     warnings.append(f"no times found: taking those of {visible(file.name)}, which has a row for each image")
     return times

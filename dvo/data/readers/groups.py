@@ -10,16 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.images.images import decode
+from dvo.core.text import visible
+from dvo.data.images.images import decode, natural_key
 from dvo.data.sensors.sensors import Listed
 
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _ROLES = {
     "right": {"right", "r", "rgt"},
-    "depth": {"depth", "depths", "depthmap", "d", "disp", "disparity", "range", "zmap"},
+    "depth": {"depth", "depths", "depthmap", "d", "range", "zmap"},
     "other": {
         "mask", "masks", "seg", "semantic", "semantics", "label", "labels", "instance", "normal", "normals", "flow",
         "ir", "infra", "infrared", "conf", "confidence", "uncertainty", "albedo", "alpha", "thumb", "aligned",
+        "disp", "disparity",
     },
     "left": {"left", "l", "lft"},
     "colour": {"color", "colour", "rgb", "image", "images", "img", "im", "frame", "col", "c"},
@@ -98,6 +100,46 @@ def split_streams(images: Sequence[Path], folder: Path) -> Streams:
     which = "the left one, " if chosen.role == "left" else ""
     note = f"several streams of images: reading {which}{chosen}; beside them are {'; '.join(parts)}"
     return Streams(chosen.files, found.get("depth"), found.get("right"), note)
+
+
+def choose_folder(folders: Sequence[Path]) -> Path | None:
+    """The folder of images to read, of several beside each other, by their names.
+
+    Args:
+        folders: two or more, in order.
+
+    Returns:
+        The only one of colour or of the left camera, or that of the lower number of two cameras (``infra1`` and
+        ``infra2``); None if the names do not tell.
+    """
+    if _are_pair(folders):
+        return folders[0]
+    found = [folder for folder in folders if _role(folder.name) in ("left", "colour", "plain")]
+    return found[0] if len(found) == 1 else None
+
+
+def others_beside(chosen: Path, others: Sequence[Path]) -> str:
+    """Note about folders of images beside the one that is read.
+
+    Args:
+        chosen: the one that is read.
+        others: those that are not used.
+    """
+    parts = []
+    for folder in others:
+        role = "right" if _are_pair([chosen, folder]) else _role(folder.name)
+        role = "mask" if "mask" in folder.name.lower() else role
+        option = f" (--{role} {visible(str(folder))})" if role in ("depth", "mask", "right") else ""
+        parts.append(visible(folder.name) + option)
+    return f"several folders of images: reading {visible(chosen.name)}; beside it are {', '.join(parts)}"
+
+
+def _are_pair(folders: Sequence[Path]) -> bool:
+    """True for two names that differ in the number of a camera, the lower one first."""
+    names = [folder.name for folder in folders]
+    if len(names) != 2 or len({re.sub(r"[0-9]+", "*", name) for name in names}) != 1:
+        return False
+    return _CAMERA.search(re.split(r"[0-9]", names[0])[0]) is not None and natural_key(names[0]) < natural_key(names[1])
 
 
 def _by_words(images: Sequence[Path]) -> list[_Group]:

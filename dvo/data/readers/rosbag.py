@@ -21,7 +21,7 @@ from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.values import from_values
 from dvo.data.files.files import is_file, lookups
 from dvo.data.files.stamps import checked_rate, read_times
-from dvo.data.images.images import used_bits
+from dvo.data.images.images import few_bits, used_bits
 from dvo.data.inertial import InertialSamples
 from dvo.data.inertial_files.tidy import joined, tidy
 from dvo.data.positions import Positions
@@ -181,8 +181,7 @@ class BagRecording:
         messages = (reader.deserialize(data, connection.msgtype) for connection, _, data in some)
         bits = used_bits(raw_levels(message, str(self.path)) for message in messages)
         if bits < 16:
-            factor = 2 ** (bits - 8)
-            self.warnings.append(f"the images of 16 bits hold {bits} bits: they are divided by {factor}, not by 257")
+            self.warnings.append(few_bits(bits))
         return bits
 
     def messages(self, topic: str) -> Iterator[tuple[float, Any]]:

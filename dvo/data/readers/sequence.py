@@ -14,9 +14,9 @@ from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, rectified
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.stamps import choose_times
-from dvo.data.images.images import has_images
+from dvo.data.images.images import has_images, natural_key
 from dvo.data.readers.folder import camera_streams, times_of_rows
-from dvo.data.readers.groups import Streams
+from dvo.data.readers.groups import Streams, choose_folder, others_beside
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
 from dvo.data.sensors.sensors import MILLIMETRES, Finder, SameName, SameNumbers, Sensors
 from dvo.data.trajectory import Trajectory, read_tum
@@ -33,22 +33,33 @@ CALIBRATIONS = ("calib.txt", "calibration.txt", "calib.yaml", "calibration.yaml"
 
 
 def image_folder(path: Path) -> Path | None:
-    """Folder of images in a sequence folder: a usual name, else the only one that holds images.
+    """Folder of images in a sequence folder: a usual name, else the only one that holds images, or the left one.
 
     Args:
         path: the sequence folder.
 
     Raises:
-        DvoError: several, and none with a usual name.
+        DvoError: several, whose names do not tell which one to read.
     """
     usual = next((path / name for name in IMAGE_FOLDERS if has_images(path / name)), None)
     if usual is not None:
         return usual
-    others = sorted(child for child in path.iterdir() if child.is_dir() and has_images(child))
-    if len(others) > 1:
+    others = folders_of_images(path)
+    chosen = choose_folder(others) if len(others) > 1 else next(iter(others), None)
+    if chosen is None and others:
         named = ", ".join(child.name for child in others)
         raise DvoError(f"several folders of images: {named}", file=path, remedy="name one of them as the source")
-    return others[0] if others else None
+    return chosen
+
+
+def folders_of_images(path: Path) -> list[Path]:
+    """Folders that hold images directly, in natural order.
+
+    Args:
+        path: the folder that they lie in.
+    """
+    found = (child for child in path.iterdir() if child.is_dir() and has_images(child))
+    return sorted(found, key=lambda child: natural_key(child.name))
 
 
 def find_calibration(path: Path) -> Calibration | None:
@@ -118,9 +129,14 @@ def open_sequence(path: Path, request: Request) -> Recording:
         images, folder, times=request.times, fps=request.fps, warnings=warnings, fallback=times_of_groundtruth
     )
     calibration = find_calibration(path)
+    sensors = _sensors(path, folder, request.calibration or calibration, streams)
+    used = [folder, *(one.folder for one in (sensors.depth, sensors.right) if isinstance(one, SameNumbers | SameName))]
+    unused = [other for other in folders_of_images(path) if other not in used]
+    if unused:
+        warnings.append(others_beside(folder, unused))
     return ImageRecording(
         "sequence", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings,
-        sensors=_sensors(path, folder, request.calibration or calibration, streams),
+        sensors=sensors,
     )  # fmt: skip
 
 

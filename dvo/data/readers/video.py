@@ -29,7 +29,7 @@ from dvo.data.inertial import InertialSamples
 from dvo.data.inertial_files.gopro import gopro_notes, read_gopro, read_gopro_positions
 from dvo.data.inertial_files.gpmf import has_telemetry
 from dvo.data.positions import Positions
-from dvo.data.readers.edit_list import shown_seconds
+from dvo.data.readers.edit_list import is_mirrored, shown_seconds
 from dvo.data.recording import EVERYTHING, Log, RawFrame, Reader, Recording, Request, Selection
 from dvo.data.trajectory import Trajectory
 
@@ -246,6 +246,8 @@ class VideoRecording:
             self.warnings.append(
                 f"the pixels of the video are not square: images of {width:g}x{height:g} are resized to {wide}x{high}"
             )
+        if is_mirrored(path):
+            self.warnings.append("the file asks for mirrored frames, as of a front camera: they are not mirrored")
         shown = shown_seconds(path)
         if shown is not None and self.frame_count is not None and RATES[0] <= rate <= RATES[1]:
             # the frames before and behind what is shown are counted, and not decoded

@@ -25,6 +25,7 @@ JOIN_TIMEOUT = 0.5
 """Seconds to wait for the thread at the end; one that hangs in a driver dies with the process."""
 LONGEST = 1_000_000
 """Longest queue, frames."""
+_SLOW = 0.25  # of the frames that are tracked: below it, a camera may move on too far between them
 _CHECK = 1.0  # seconds after which a waiting consumer looks again, see LiveFrames._wait
 
 
@@ -254,7 +255,9 @@ class LiveFrames(Generic[T]):
         received, dropped = self.counts.received, self.counts.dropped
         if not (self._iterated and dropped):
             return []
-        return [f"{dropped} of {received} frames were dropped, the stream is faster than tracking"]
+        is_fast = received - dropped < _SLOW * received
+        remedy = ": --preset fast, smaller images or a slower camera help" if is_fast else ""
+        return [f"{dropped} of {received} frames were dropped, the stream is faster than tracking{remedy}"]
 
     def start(self) -> None:
         """Begin to read; otherwise the iteration does. What is dropped before the iteration is not counted.

@@ -21,6 +21,7 @@ from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.focal_guess import guess_from_angle
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.stamps import checked_rate
+from dvo.data.images.fields import INTERLACED_STREAM, FieldTest
 from dvo.data.images.images import decode_bytes, to_rgb8
 from dvo.data.inertial import InertialSamples
 from dvo.data.interval import Bound, Interval
@@ -316,11 +317,31 @@ def _of_pipe(file: Any, fps: float | None, queue: int | None, stopped: threading
             yield _Encoded(index, clock(time.monotonic()) if fps is None else index / fps, data)
 
     times = "arrival" if fps is None else "fps"
-    return LiveRecording(_live(images(), name, fps is not None, queue, stopped), partial(_decoded, name), times)
+    decoder = _Decoder(name)
+    recording = LiveRecording(_live(images(), name, fps is not None, queue, stopped), decoder, times)
+    decoder.warnings = recording.warnings
+    return recording
 
 
-def _decoded(name: str, item: _Encoded) -> RawFrame | None:
-    image = decode_bytes(item.data, name)
-    if image is None:
-        return None
-    return RawFrame(item.index, item.timestamp, to_rgb8(image), f"{name} image {item.index}")
+class _Decoder:
+    """Decodes the images of a pipe, and looks at the first of them for interlacing."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self.warnings = name, list[str]()
+        self._fields: FieldTest | None = FieldTest()
+        self._last = -1  # the image that was looked at last
+
+    def __call__(self, item: _Encoded) -> RawFrame | None:
+        image = decode_bytes(item.data, self.name)
+        if image is None:
+            return None
+        pixels = to_rgb8(image)
+        if self._fields is not None and item.index > self._last:
+            if item.index > self._last + 1:
+                self._fields.skip()
+            self._last = item.index
+            self._fields.look(pixels)
+            if self._fields.is_done:
+                self.warnings += [INTERLACED_STREAM] * self._fields.is_interlaced
+                self._fields = None
+        return RawFrame(item.index, item.timestamp, pixels, f"{self.name} image {item.index}")

@@ -420,6 +420,70 @@ MVG = {"width": 640, "height": 480, "focal_length": 500.0, "principal_point": [3
 SQUARE = (500, 500, 320, 240)
 NUMBERS = (500, 510, 320, 240)
 FULL = {"fl_x": 500, "fl_y": 510, "cx": 320.5, "cy": 240.5, "w": 640, "h": 480}
+MRCAL = """# made with mrcal
+{{
+    'lensmodel':  'LENSMODEL_{}',
+
+    # intrinsics are fx,fy,cx,cy,distortion0,distortion1,....
+    'intrinsics': [ 500, 510, 320, 240,{}],
+
+    'extrinsics': [ 0, 0.78, -0, -0, -0, -0,],
+
+    'imagersize': [ 640, 480,],
+}}
+"""
+ZED = """[LEFT_CAM_HD]
+fx=700
+fy=701
+cx=640.5
+cy=360.5
+{}
+[RIGHT_CAM_HD]
+fx=702
+fy=703
+cx=641.5
+cy=361.5
+k1=0.2
+[STEREO]
+Baseline=119.905
+CV_HD=0.00697667
+Name=unknown
+"""
+ZED_NUMBERS = (700, 701, 640.5, 360.5)
+METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
+<calibration>
+  <projection>{}</projection>
+  <width>640</width>
+  <height>480</height>
+  <f>510</f>
+  <cx>0.5</cx>
+  <cy>0.5</cy>
+  <b1>-10</b1>
+  <k1>0.1</k1>
+  <k2>-0.2</k2>
+  {}
+  <date>2020-01-01T00:00:00Z</date>
+</calibration>
+"""
+CHUNK = """<document version="1.5.0"><chunk><sensors next_id="2"><sensor id="0" label="a" type="frame">
+<resolution width="640" height="480"/><bands><band label="Red"/><band label="Green"/></bands>
+<calibration type="frame" class="initial"><resolution width="640" height="480"/><f>400</f></calibration>
+<calibration type="frame" class="adjusted"><resolution width="640" height="480"/><f>500</f>{}</calibration>
+<covariance><params>f cx</params></covariance></sensor>{}</sensors></chunk></document>
+"""
+OTHER_SENSOR = """<sensor id="1" label="b" type="frame"><calibration type="frame" class="adjusted">
+<resolution width="640" height="480"/><f>600</f></calibration></sensor>"""
+
+
+def depthai(*cameras):
+    """A file of DepthAI: type, matrix, coefficients of each socket."""
+    pairs = [[n, {"cameraType": kind, "intrinsicMatrix": matrix, "distortionCoeff": lens, "width": 640, "height": 480,
+                  "specHfovDeg": 71.86, "lensPosition": 0, "extrinsics": {"toCameraSocket": -1}}]
+             for n, (kind, matrix, lens) in enumerate(cameras)]  # fmt: skip
+    return json.dumps({"boardName": "OAK-D", "cameraData": pairs, "version": 7})
+
+
+OAK = [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
 READ = [
     ("slam2.yaml", SLAM, NUMBERS, "radtan", FIVE, (640, 480)),
     ("slam2_stereo.yaml", SLAM + STEREO, NUMBERS, "radtan", FIVE, (640, 480)),
@@ -582,6 +646,24 @@ READ = [
      SQUARE, "radtan", FIVE, (640, 480)),
     ("fisheye.json", openmvg(("fisheye", MVG | {"fisheye": KC})), SQUARE, "fisheye", KC, (640, 480)),
     ("pinhole.json", openmvg(("pinhole", MVG)), SQUARE, "none", (), (640, 480)),
+    ("cam.cameramodel", MRCAL.format("OPENCV8", str(EIGHT)[1:]).replace(")", ""), NUMBERS, "radtan", EIGHT, (640, 480)),
+    ("pinhole.cameramodel", MRCAL.format("PINHOLE", "").replace("lensmodel", "lens_model"), NUMBERS, "none", (),
+     (640, 480)),
+    ("SN1.conf", ZED.format("k1=0.1\nk2=-0.2\np1=0.003\np2=0.004\nk3=0.05"), ZED_NUMBERS, "radtan", FIVE, (1280, 720)),
+    ("SN2.conf", ZED.format("") + "[LEFT_DISTO]\nk1=.1\nk2=-.2\np1=.003\np2=.004\nk3=.05\nk4=.06\nk5=.07\nk6=.08\n",
+     ZED_NUMBERS, "radtan", EIGHT, (1280, 720)),
+    ("metashape.xml", METASHAPE.format("frame", "<k3>0.05</k3><p1>0.004</p1><p2>0.003</p2>"), NUMBERS, "radtan", FIVE,
+     (640, 480)),
+    ("metashape_fisheye.xml", METASHAPE.format("fisheye", "<k3>0.003</k3><k4>0.004</k4>"), NUMBERS, "fisheye", KC,
+     (640, 480)),
+    ("doc.xml", CHUNK.format("<cx>0.5</cx><cy>0.5</cy><b1>0</b1><k1>.1</k1><k2>-.2</k2>", ""), (500, 500, 320, 240),
+     "radtan", (0.1, -0.2, 0, 0, 0), (640, 480)),
+    ("oak.json", depthai((0, [[0.0] * 3] * 3, []), (0, OAK, [*EIGHT, *[0.0] * 6])), NUMBERS, "radtan", EIGHT,
+     (640, 480)),
+    ("oak_w.json", depthai((1, OAK, [*KC, *[0.0] * 10])), NUMBERS, "fisheye", KC, (640, 480)),
+    ("record3d.json", json.dumps({"w": 640, "h": 480, "fps": 60, "K": [500, 0, 0, 0, 510, 0, 320, 240, 1],
+     "cameraType": 1, "perFrameIntrinsicCoeffs": [[500, 510, 320, 240]] * 3, }), NUMBERS, "none", (), (640, 480)),
+    ("a.pincam", "640 480 500 510 320 240\n", NUMBERS, "none", (), (640, 480)),
     ("calib_cam_to_cam.txt", KITTI_RAW, (721.5377, 721.5377, 609.5593, 172.854), "none", (), (1242, 375)),
     ("kitti_recorded.txt", KITTI_RAW.replace("_rect", "_left"), (984.2439, 980.8141, 690, 233.1966), "radtan",
      (-0.3728755, 0.2037299, 0.002219027, 0.001383707, -0.07233722), (1392, 512)),
@@ -672,6 +754,29 @@ def test_entries_of_other_matters_are_ignored(make, line):
 
 
 REFUSED = [
+    ("cam.cameramodel", MRCAL.format("CAHVOR", " .1, .2, .3, .4, .5"), "LENSMODEL_CAHVOR is not known"),
+    ("cam.cameramodel", MRCAL.format("OPENCV5", " .1, .2, .3, .4"), "LENSMODEL_OPENCV5 has 9 numbers"),
+    ("cam.cameramodel", MRCAL.format("OPENCV5", "")[:-3], "no dictionary of Python"),
+    ("SN.conf", ZED.format("") + ZED.format("").replace("_HD", "_VGA"), "4 cameras in it: 0: LEFT_CAM_HD"),
+    ("SN.conf", "[LEFT_CAM_CAM_HD]\nfx=1\n", "no fx, fy, cx, cy in it"),
+    ("SN.conf", ZED.format("k1=.1\nk1=.2"), "k1: twice"),
+    ("SN.conf", ZED.format("") + "[LEFT_DISTO]\nk1=1\nk2=2\nk3=3\nk4=4\n", "may be that of a fisheye"),
+    ("SN.conf", ZED.format("").replace("fx=700", ""), "no fx, fy, cx, cy in it"),
+    ("a.xml", METASHAPE.format("frame", "<k4>0.1</k4>"), "a camera of type frame of dvo has no k4"),
+    ("a.xml", METASHAPE.format("fisheye", "<p1>0.1</p1>"), "has no p1"),
+    ("a.xml", METASHAPE.format("frame", "<b2>3</b2>"), "skew"),
+    ("a.xml", METASHAPE.format("spherical", ""), "cameras of type 'spherical' are not known"),
+    ("a.xml", METASHAPE.format("frame", "").replace("640", ""), "no size of the images"),
+    ("a.xml", CHUNK.format("", OTHER_SENSOR), "2 cameras in it: 0: a, 1: b"),
+    ("oak.json", depthai((0, OAK, []), (0, OAK, [*KC])), "2 cameras in it: 0: socket 0 640x480"),
+    ("oak.json", depthai(([], OAK, [*KC])), "cameras of type \\[\\] are not known"),
+    ("oak.json", depthai((2, OAK, [*KC])), "cameras of type 2 are not known"),
+    ("oak.json", depthai((0, OAK, [*EIGHT, 0, 0, 0, 0, 0.1, 0.2])), "14 coefficients"),
+    ("oak.json", depthai(), "no camera in it"),
+    ("coded.json", json.dumps({"fx": 500, "fy": 510, "cx": 320, "cy": 240, "cameraType": 1, "d": KC}),
+     "cameraType: unknown distortion model '1'"),
+    ("a.pincam", "nan 480 500 510 320 240\n", "resolution: expected width and height"),
+    ("six.txt", "640 480 500 510 320 240\n", "6 numbers"),
     ("c.yaml", VSLAM.format("equirectangular", ""), "unknown distortion model 'equirectangular'"),
     ("c.yaml", VSLAM.format("radial_division", ""), "unknown distortion model"),
     ("c.yaml", VSLAM.format("fisheye", "p1: 0.1"), "Camera.p1"),
@@ -685,7 +790,7 @@ REFUSED = [
     ("c.yaml", f"{PINHOLE}model: eucm\nalpha: 0.5\n", "1 coefficients"),
     ("c.yaml", f"left: {{{PINHOLE.replace(chr(10), ', ')}}}\nfront: {{fx: 1, fy: 1, cx: 1, cy: 1}}\n"
      "left_2: 3\n".replace("left:", "back:"), "2 cameras in it: "),
-    ("c.yaml", f"{PINHOLE}---\n{PINHOLE.replace('500', '400')}", "2 documents with different cameras"),
+    ("c.yaml", f"{PINHOLE}---\n{PINHOLE.replace('500', '400')}", "a list of 2 cameras that differ"),
     ("c.yaml", "fx: 500\nfy: 510\n", "no cx, cy in it"),
     ("c.yaml", "camera: {exposure: 3}\nname: x\n", "no fx, fy, cx, cy in it, nor a camera matrix: camera, name"),
     ("c.json", "{", "not valid JSON"),
@@ -720,10 +825,6 @@ REFUSED = [
     ("calib_cam_to_cam.txt", KITTI_RAW.replace("P_rect_00: 7", "P_rect_00: x"), "not a number"),
     ("realsense.json", json.dumps({"fx": 500, "fy": 510, "ppx": 320, "ppy": 240, "model": "inverse_brown_conrady",
      "coeffs": [0.1] * 5}), "inverse_brown_conrady"),
-    ("metashape.xml", "<calibration><projection>fisheye</projection><width>640</width><height>480</height><f>500</f>"
-     "<cx>3.5</cx><cy>4.5</cy></calibration>", "an offset from their centre"),
-    ("sensor.xml", '<a><sensor type="frame"><calibration type="frame"><resolution width="640" height="480"/><f>500</f>'
-     "<cx>3.5</cx><cy>4.5</cy></calibration></sensor></a>", "an offset from their centre"),
     ("centre.yaml", "fx: 500\nfy: 510\ncx: 0.5\ncy: 0.5\nwidth: 640\nheight: 480\n", "or a share of the size"),
     ("centre.txt", "500 510 0.5 0.5", "a share of the size"),
     ("middlebury.txt", MIDDLEBURY.format(320, 0).replace("193.001", "wide"), "baseline: no numbers: 'wide'"),

@@ -75,6 +75,9 @@ HEADERS = {
         "33333333,1,2,3,.9,.1,.2,.3,8",
     "%time,field.pose.position.x,field.pose.position.y,field.pose.position.z,field.pose.orientation.x,"
     "field.pose.orientation.y,field.pose.orientation.z,field.pose.orientation.w": "33333333,1,2,3,.1,.2,.3,.9",
+    "#timestamp [ns], vertex index, p_G_Ix [m], p_G_Iy [m], p_G_Iz [m], q_G_Iw, q_G_Ix, q_G_Iy, q_G_Iz, v_x, v_y, v_z":
+    "33333333,7,1,2,3,.9,.1,.2,.3,4,5,6",
+    "time [s],idx,posx,posy,posz,rotx,roty,rotz,rotw,max": ".033333333,7,1,2,3,.1,.2,.3,.9,8",
     "sec,nsec,x,y,z,qx,qy,qz,qw": "0,33333333,1,2,3,.1,.2,.3,.9",
     "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.child_frame_id,field.pose.pose.position.x,"
     "field.pose.pose.position.y,field.pose.pose.position.z,field.pose.pose.orientation.x,field.pose.pose.orientation.y,"
@@ -163,3 +166,41 @@ def test_relative_milliseconds_of_a_truth_follow_the_images(make):
     file = make.text("t.txt", "".join(f"{round(1000 * i / 30)} {i} 0 0 0 0 0 1\n" for i in range(10)))
     found = read_groundtruth(file, np.arange(10) / 30)
     np.testing.assert_allclose(found.timestamps, np.arange(10) / 30, atol=1e-3)
+
+
+@pytest.mark.parametrize("base", [0, 1])
+@pytest.mark.parametrize("last", ["", " 0 0 0 1"])
+def test_numbers_of_images_in_place_of_times(make, base, last):
+    """KITTI-360 has them before its matrices, with gaps; others before a quaternion."""
+    images = 1e9 + np.arange(12) / 30
+    file = make.text("k.txt", "".join(f"{i} 1 0 0 {i} 0 1 0 0 0 0 1 0{last}\n" for i in (1, 3, 4, 9)))
+    notes: list[str] = []
+    found = read_groundtruth(file, images, notes)
+    assert found.timestamps.tolist() == images[[1, 3, 4, 9]].tolist() and found.poses_wc[:, 0].tolist() == [1, 3, 4, 9]
+    assert len(notes) == 1 and "numbers of images, from 0" in notes[0]
+    file = make.text("t.txt", "".join(f"{i + base:.18e} {i} 0 0 0 0 0 1\n" for i in range(12)))
+    assert read_groundtruth(file, images).timestamps.tolist() == images.tolist()
+
+
+def test_whole_seconds_stay_seconds(make):
+    file = make.text("t.txt", "".join(f"{i} {i} 0 0 0 0 0 1\n" for i in range(10)))
+    notes: list[str] = []
+    assert read_groundtruth(file, np.arange(300) / 30, notes).timestamps.tolist() == list(range(10)) and not notes
+
+
+def test_as_many_poses_as_images_in_another_span(make):
+    file = make.text("t.txt", "".join(f"{i / 10} {i} 0 0 0 0 0 1\n" for i in range(10)))
+    notes: list[str] = []
+    read_groundtruth(file, np.arange(10) / 10.1, notes)
+    assert not notes
+    assert len(read_groundtruth(file, np.arange(10) / 20, notes)) == 10
+    assert len(notes) == 1 and "span 0.9 s and the images 0.45 s" in notes[0]
+
+
+def test_rows_of_vins_without_a_header_are_refused(make):
+    row = "33333333{},1,2,3,.9,.1,.2,.3,\n"
+    with pytest.raises(DvoError, match="line 1: 8 numbers without a header, and a comma behind them") as caught:
+        read_tum(make.text("vio.csv", row.format(0) + row.format(1)))
+    assert "timestamp,tx,ty,tz,qw,qx,qy,qz" in str(caught.value.remedy)
+    found = read_tum(make.text("vio.csv", "timestamp,tx,ty,tz,qw,qx,qy,qz\n" + row.format(0)))
+    assert found.poses_wc[0, 6] == pytest.approx(0.9 / np.sqrt(0.95))

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dvo.data.images.image_header import image_size
+from dvo.data.images.image_header import holds_several, image_size
 from dvo.data.images.images import is_complete
 
 
@@ -81,3 +81,37 @@ def test_a_png_whose_chunk_is_longer_than_the_file_is_not_complete() -> None:
     for length in (len(code), 2**31 + 5, 2**32 - 1):
         code[at : at + 4] = struct.pack(">I", length)
         assert not is_complete(bytes(code))
+
+
+def test_files_of_several_images(tmp_path: Path) -> None:
+    images = [np.full((37, 53, 3), 40 * k, np.uint8) for k in range(3)]
+    for name in ("pages.tif", "animated.png", "animated.webp"):
+        assert not holds_several(tmp_path / name)
+        assert cv2.imwrite(str(tmp_path / name), images[0])
+        assert not holds_several(tmp_path / name)
+    assert cv2.imwritemulti(str(tmp_path / "pages.tif"), images)
+    for name in ("animated.png", "animated.webp"):
+        animation = cv2.Animation()
+        animation.frames, animation.durations = images, [100] * 3
+        assert cv2.imwriteanimation(str(tmp_path / name), animation)
+    assert all(holds_several(tmp_path / name) for name in ("pages.tif", "animated.png", "animated.webp"))
+
+
+@pytest.mark.parametrize(("kind", "several"), [(0, True), (1, False), (4, False)])
+@pytest.mark.parametrize("big", [False, True])
+def test_reduced_copies_and_masks_in_a_tiff_are_no_pages(tmp_path: Path, kind: int, several: bool, big: bool) -> None:
+    file, offset, counts = tmp_path / "a.tif", "<Q" if big else "<I", "<Q" if big else "<H"
+    size, start = (20, 16) if big else (12, 8)
+    directory = struct.calcsize(counts) + size + struct.calcsize(offset)
+
+    def page(kind: int, following: int) -> bytes:
+        row = struct.pack("<HHQQ", 254, 4, 1, kind) if big else struct.pack("<HHII", 254, 4, 1, kind)
+        return struct.pack(counts, 1) + row + struct.pack(offset, following)
+
+    head = struct.pack("<4sHHQ", b"II+\0", 8, 0, start) if big else struct.pack("<4sI", b"II*\0", start)
+    file.write_bytes(head + page(0, start + directory) + page(kind, 0))
+    assert holds_several(file) is several
+    file.write_bytes(head + page(0, start))  # a directory that follows itself
+    assert holds_several(file)
+    file.write_bytes((head + page(0, start + directory))[:-1])
+    assert not holds_several(file)

@@ -189,3 +189,50 @@ def test_backslashes_in_lists(make):
     make.images("s/rgb", ["1.png", "2.png"])
     make.text("s/rgb.txt", "timestamp filename\n1.0 rgb\\1.png\n1.5 rgb\\2.png\n")
     assert len(list(dvo.open(make.root / "s", calib=make.calib()))) == 2
+
+
+@pytest.mark.parametrize(
+    ("folders", "said"),
+    [
+        (["L", "R"], ["R (--right "]),
+        (["cam_left", "cam_right"], ["cam_right (--right "]),
+        (["infra2", "infra1"], ["infra2 (--right "]),
+        (["view_9", "view_10"], ["view_10 (--right "]),
+        (["image_0", "image_1"], ["image_1 (--right "]),
+        (["rgb", "depth", "masks"], ["depth (--depth ", "masks (--mask "]),
+        (["color", "disparity"], ["disparity"]),
+    ],
+)
+def test_folders_beside_the_one_that_is_read(make, folders, said):
+    for name in folders:
+        write(make, f"clip_{name}", "{:03d}.png")
+    clip = make.root / "clip"
+    clip.mkdir()
+    for name in folders:
+        (make.root / f"clip_{name}").rename(clip / name)
+    source = dvo.open(clip, calib=make.calib(), fps=10)
+    chosen = "infra1" if "infra1" in folders else folders[0]
+    assert source.recording.images[0].parent.name == chosen
+    (note,) = source.warnings
+    assert f"reading {chosen}; beside it are " in note and all(part in note for part in said)
+    assert "disparity (" not in note
+
+
+def test_folders_that_no_name_tells_apart(make):
+    for name in ("front", "back"):
+        write(make, name, "{:03d}.png")
+    with pytest.raises(DvoError, match="several folders of images: back, front"):
+        dvo.open(make.root, calib=make.calib(), fps=10)
+
+
+def test_hexadecimal_numbers_are_in_order(make):
+    folder = write(make, "clip", "{:02x}.png", count=20)
+    assert [path.stem for path in list_images(folder)] == [f"{i:02x}" for i in range(20)]
+
+
+def test_jpeg_files_of_other_endings(make):
+    folder = make.root / "clip"
+    folder.mkdir()
+    for i, ending in enumerate(("jfif", "jpe", "JPG")):
+        (folder / f"{i}.{ending}").write_bytes(cv2.imencode(".jpg", make.image(i))[1].tobytes())
+    assert len(list(dvo.open(folder, calib=make.calib(), fps=10))) == 3

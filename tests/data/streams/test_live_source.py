@@ -250,6 +250,18 @@ def test_a_pipe_without_a_rate_is_live(make):
         assert [frame.index for frame in source] == [5] and source.times == "arrival"
 
 
+@pytest.mark.parametrize(("interlaced", "dropped"), [(True, ()), (False, ()), (False, (2, 5, 6, 9, 10, 11))])
+def test_an_interlaced_pipe_is_told(make, interlaced, dropped):
+    """Images that were dropped do not make progressive ones look interlaced."""
+    images = list(woven(moving(32, 2), True)) if interlaced else list(moving(24, 2))
+    codes = [cv2.imencode(".png", image)[1].tobytes() for image in images]
+    codes = [b"\xff\xd8\xff\xd9" if index in dropped else code for index, code in enumerate(codes)]
+    calib = make.text("calib.txt", "300 300 159.5 119.5")
+    source = open_stream(io.BytesIO(b"".join(codes)), calib=calib, fps=20)
+    assert len(list(source)) == len(images) - len(dropped)
+    assert sum("interlaced" in said and "bwdif" in said for said in source.warnings) == interlaced
+
+
 def test_a_compressed_file(make):
     data = gzip.compress(b"".join(jpegs(make)))
     source = open_stream(gzip.GzipFile(fileobj=io.BytesIO(data)), calib=make.calib(), fps=20)

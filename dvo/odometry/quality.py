@@ -28,7 +28,7 @@ MAX_SHIFT_GAIN = 0.4
 """Share of the cost of the followed corners of a pair of images that a shift explains, upper quartile of the pairs,
 above which the crop of the picture floats (:mod:`dvo.odometry.checks.floating_crop`)."""
 MOST_FIXED = 0.2
-"""Share of the image that is fixed to the camera: it takes part until it is found, so that the beginning suffers."""
+"""Share of the image that is fixed to the camera: what is not found of it takes part, and what is left may be little."""
 WRONG_FOCAL = 0.12
 """Logarithm of the focal length that the measurements ask for over the one that is given."""
 FEWEST_CHECKS = 3
@@ -154,7 +154,7 @@ def judge(quality: Quality, frames: int, cause: str = "") -> tuple[Verdict, str,
     if quality.still > MOST_STILL:
         return "doubtful", f"too little of the picture moves for {quality.still:.0%} of the time", FILM
     if quality.fixed > MOST_FIXED:
-        return "doubtful", f"{quality.fixed:.0%} of the picture are fixed to the camera; found only after a while", MASK
+        return "doubtful", f"{quality.fixed:.0%} of the picture are fixed to the camera", MASK
     if quality.tracked < LEAST_TRACKED:
         return "doubtful", f"{quality.tracked:.0%} of the frames have a pose", FILM
     if quality.jumps > MOST_JUMPS * max(frames / 100, 1):

@@ -28,7 +28,7 @@ MAX_SHIFT_GAIN = 0.4
 """Share of the cost of the followed corners of a pair of images that a shift explains, upper quartile of the pairs,
 above which the crop of the picture floats (:mod:`dvo.odometry.checks.floating_crop`)."""
 MOST_FIXED = 0.2
-"""Share of the image that is fixed to the camera: what is not found of it takes part, and what is left may be little."""
+"""Share of the image that is fixed to the camera: some of it may take part, and what is left may be little."""
 WRONG_FOCAL = 0.12
 """Logarithm of the focal length that the measurements ask for over the one that is given."""
 FEWEST_CHECKS = 3

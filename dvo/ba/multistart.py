@@ -108,8 +108,6 @@ def multistart(
     problem = problem.exact()
 
     def solved(name: str, now: PatchProblem, iterations: int) -> Solution:
-        if iterations == 0:
-            return rated(name, now, float(now.robust_cost(options.kernel, options.max_residual)))
         steps = replace(options.solver, max_iterations=iterations)
         result = solve(now, replace(options, solver=steps))
         blocks = {name: block.with_value(result.blocks[name]) for name, block in now.blocks.items()}
@@ -239,10 +237,8 @@ def rotations_first(problem: PatchProblem, options: GlobalBAOptions) -> PatchPro
         The problem at these values.
     """
     poses = se3.identity(len(problem.poses_cw), dtype=problem.poses_cw.dtype)
-    far = problem.with_values(
-        poses_cw=poses, inverse_depths=torch.full_like(problem.inverse_depths, _FAR), factors=(), blocks={}
-    )
-    turned = solve(far, BAOptions(motion_only=True, iterations=4)).poses_cw
+    far = _at(problem, poses, torch.full_like(problem.inverse_depths, _FAR))
+    turned = solve(far, BAOptions(motion_only=True, iterations=4, check=False)).poses_cw
     return _cold(problem, torch.cat([torch.zeros_like(turned[:, :3]), turned[:, 3:]], 1))
 
 
@@ -254,14 +250,21 @@ def _posed(problem: PatchProblem, options: GlobalBAOptions) -> PatchProblem:
     return problem.with_values(poses_cw=se3.normalise(found.poses_cw))
 
 
+def _at(problem: PatchProblem, poses_cw: Tensor, inverse_depths: Tensor) -> PatchProblem:
+    """The reprojection alone at other values, in the precision of the window's kernels: a start needs no more."""
+    now = problem.with_values(poses_cw=poses_cw, inverse_depths=inverse_depths, factors=(), blocks={})
+    names = ("poses_cw", "patches", "intrinsics", "targets", "weights")
+    return now.with_values(**{name: getattr(now, name).float() for name in names})
+
+
 def _cold(problem: PatchProblem, poses_cw: Tensor) -> PatchProblem:
-    depths = torch.ones_like(problem.inverse_depths)
-    now = problem.with_values(poses_cw=poses_cw, inverse_depths=depths, factors=(), blocks={})
+    now = _at(problem, poses_cw, torch.ones_like(problem.inverse_depths))
     for update in range(_COLD_UPDATES):
-        result = solve(now, BAOptions(damping=damping_at(update)))
+        result = solve(now, BAOptions(damping=damping_at(update), check=False))
         now = now.with_values(poses_cw=result.poses_cw, patches=result.patches)
-    moved = se3.compose(now.poses_cw, problem.poses_cw[:1].expand_as(now.poses_cw))
-    return problem.with_values(poses_cw=se3.normalise(moved), patches=now.patches)
+    found = now.poses_cw.to(problem.poses_cw)
+    moved = se3.compose(found, problem.poses_cw[:1].expand_as(found))
+    return problem.with_values(poses_cw=se3.normalise(moved), inverse_depths=now.inverse_depths)
 
 
 DEPTH_STARTS: dict[str, Start] = {"reversed": reversed_relief, "equal": equal_depths}

@@ -20,6 +20,8 @@ from dvo.ba.kernels import Kernel
 from dvo.ba.options import BAOptions
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.solve import solve
+from dvo.ba.sparse.global_adjust import GlobalBAOptions
+from dvo.ba.sparse.levenberg import LMOptions
 from dvo.core.command_line import OneLineParser
 from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.nets.alignment.alignment import align_patches
@@ -64,9 +66,9 @@ def alignment(generator: torch.Generator, device: torch.device) -> tuple[str, Ca
     return f"{edges} edges", lambda: align_patches(images, source, source, centres, start, warps).positions
 
 
-def window_solver(generator: torch.Generator, device: torch.device) -> tuple[str, Call]:
-    """Two Gauss-Newton steps on a window."""
-    frames, per_frame, options = 9, 24, BAOptions(fixed=2, bounds=(80, 60), kernel=Kernel("cauchy", 0.3), check=False)
+def window(generator: torch.Generator, device: torch.device) -> PatchProblem:
+    """Window of a tracker, a batch of one."""
+    frames, per_frame = 9, 24
     count = frames * per_frame
     poses = torch.cat([0.05 * torch.rand(1, frames, 3, generator=generator), torch.zeros(1, frames, 3)], 2)
     poses = torch.cat([poses, torch.ones(1, frames, 1)], 2)
@@ -78,8 +80,23 @@ def window_solver(generator: torch.Generator, device: torch.device) -> tuple[str
     weights = torch.rand(1, len(kk), 2, generator=generator)
     poses, patches, intrinsics = (x.to(device) for x in (poses, patches.contiguous(), intrinsics))
     targets, weights, ii, jj, kk = (x.to(device) for x in (targets, weights, kk // per_frame, jj, kk))
-    problem = PatchProblem(poses, patches, intrinsics, targets, weights, ii, jj, kk)
-    return f"{len(kk)} edges", lambda: solve(problem, options).poses_cw
+    return PatchProblem(poses, patches, intrinsics, targets, weights, ii, jj, kk)
+
+
+def window_solver(generator: torch.Generator, device: torch.device) -> tuple[str, Call]:
+    """Two Gauss-Newton steps on a window."""
+    problem = window(generator, device)
+    options = BAOptions(fixed=2, bounds=(80, 60), kernel=Kernel("cauchy", 0.3), check=False)
+    return f"{len(problem.kk)} edges", lambda: solve(problem, options).poses_cw
+
+
+def small_graph(generator: torch.Generator, device: torch.device) -> tuple[str, Call]:
+    """Eight Levenberg-Marquardt steps on a window, as from each start of :mod:`dvo.ba.multistart`."""
+    problem = window(generator, device)
+    names = ("poses_cw", "patches", "intrinsics", "targets", "weights")
+    one = problem.with_values(**{name: getattr(problem, name)[0].double() for name in names}).planned()
+    options = GlobalBAOptions(fixed=2, kernel=Kernel("cauchy", 0.3), solver=LMOptions(max_iterations=8, tolerance=0.0))
+    return f"{len(problem.kk)} edges", lambda: solve(one, options).poses_cw
 
 
 KERNELS: dict[str, Callable[[torch.Generator, torch.device], tuple[str, Call]]] = {
@@ -87,6 +104,7 @@ KERNELS: dict[str, Callable[[torch.Generator, torch.device], tuple[str, Call]]] 
     "correlation, level 4": lambda generator, device: edge_correlation(generator, device, 4),
     "alignment": alignment,
     "window solver": window_solver,
+    "small graph": small_graph,
 }
 """By name: a function of a random generator and a device that returns a description of the size and a call to time,
 which asks :func:`dvo.core.kernels.use_kernels`."""

@@ -30,7 +30,8 @@ from dvo.core.kernels import is_transformed, use_kernels
 from dvo.geometry.bounds import MIN_Z_VALID
 
 Array = np.ndarray[Any, Any]
-_ROBUST = {"none": 0, "huber": 1, "cauchy": 2}
+ROBUST = {"none": 0, "huber": 1, "cauchy": 2}
+"""Robust kernels by their numbers in compiled code."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class EdgewiseReprojection(Factor):
         margin = math.inf if self.bounds is None else MARGIN
         middle = width / 2, height / 2
         gate = MIN_Z_VALID, self.max_residual, *middle, middle[0] + margin, middle[1] + margin, self.kernel.width
-        return tuple(float(x) for x in gate), _ROBUST[self.kernel.name]
+        return tuple(float(x) for x in gate), ROBUST[self.kernel.name]
 
 
 def measured_edges(

@@ -487,6 +487,74 @@ def _clear(depth_damping: float, h_pp: Array, h_lp: Array, h_ll: Array, g_p: Arr
             h_lp[k, a] = 0.0
 
 
+@part
+def _rho(s: float, robust: int, width: float) -> float:
+    """Robust cost of a squared residual, as :meth:`dvo.ba.kernels.Kernel.cost`."""
+    square = width * width
+    if robust == HUBER:
+        return s if s <= square else 2 * width * math.sqrt(s) - square
+    return square * math.log1p(s / square) if robust == CAUCHY else s
+
+
+@compiled
+def robust_cost(
+    poses: Array,
+    depths: Array,
+    centres: Array,
+    intrinsics: Array,
+    targets: Array,
+    weights: Array,
+    ii: Array,
+    jj: Array,
+    kk: Array,
+    pairs: Array,
+    ends: Array,
+    gate: tuple[float, ...],
+    robust: int,
+    counted: Array,
+) -> float:
+    """Half the sum of robust squared residuals, where an edge that does not count costs as the longest residual.
+
+    Args:
+        poses, depths, centres, intrinsics, targets, weights, ii, jj, kk, pairs, ends, gate, robust: see
+            :func:`add_reprojection`; there are no bounds of the feature map.
+        counted: ``(E,)`` filled: edges that count, with a weight.
+    """
+    motions = _pair_motions(poses, ends)
+    least_z, longest, width = gate[0], gate[1] * gate[1], gate[6]
+    total = 0.0
+    for edge in range(len(ii)):
+        i, j, k = ii[edge], jj[edge], kk[edge]
+        m, d, wx, wy = motions[pairs[edge]], depths[k], weights[edge, 0], weights[edge, 1]
+        u = (centres[k, 0] - intrinsics[i, 2]) / intrinsics[i, 0]
+        v = (centres[k, 1] - intrinsics[i, 3]) / intrinsics[i, 1]
+        z = m[2, 0] * u + m[2, 1] * v + m[2, 2] + m[2, 3] * d
+        s, here = max(wx, wy) * longest, False
+        if z > least_z:
+            x = (m[0, 0] * u + m[0, 1] * v + m[0, 2] + m[0, 3] * d) / z
+            y = (m[1, 0] * u + m[1, 1] * v + m[1, 2] + m[1, 3] * d) / z
+            rx = targets[edge, 0] - intrinsics[j, 2] - x * intrinsics[j, 0]
+            ry = targets[edge, 1] - intrinsics[j, 3] - y * intrinsics[j, 1]
+            if rx * rx + ry * ry < longest:
+                s, here = wx * rx * rx + wy * ry * ry, wx > 0 or wy > 0
+        counted[edge] = here
+        total += _rho(s, robust, width)
+    return 0.5 * total
+
+
+@compiled
+def move_poses(poses: Array, rows: Array, steps: Array) -> None:
+    """Left retraction of the poses that move, in place.
+
+    Args:
+        poses: ``(N, 7)``. rows: ``(N,)`` first row of each in the steps, negative for a pose that stays.
+        steps: ``(P,)``.
+    """
+    for n in range(len(poses)):
+        if rows[n] >= 0:
+            _retract_pose(poses[n], steps[rows[n] : rows[n] + 6])
+
+
 @compiled
 def take_steps(
     poses: Array,

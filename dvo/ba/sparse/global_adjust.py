@@ -9,11 +9,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES, intrinsics_block, inverse_depth_block, pose_block
+from dvo.ba.blocks import (
+    INTRINSICS,
+    INVERSE_DEPTHS,
+    POSES,
+    free_slots,
+    intrinsics_block,
+    inverse_depth_block,
+    pose_block,
+)
 from dvo.ba.checks import REAL, WHOLE, check_kind, check_positive, check_range, check_switch, check_tensor, check_within
 from dvo.ba.edges import check_index, plan_edges
 from dvo.ba.kernels import Kernel
@@ -25,6 +34,7 @@ from dvo.ba.sparse.equations import SparseSystem
 from dvo.ba.sparse.global_edges import ReprojectionEdges
 from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
 from dvo.ba.sparse.schur_pattern import SchurPattern, make_schur_pattern
+from dvo.ba.sparse.small_problem import SmallProblem, is_small
 from dvo.core.context import full_precision
 from dvo.core.errors import DvoError
 from dvo.core.threads import use_threads
@@ -144,22 +154,27 @@ def adjust_sparse(problem: PatchProblem, options: GlobalBAOptions) -> GlobalBARe
     check_kind(options, "options", GlobalBAOptions)
     problem, unseen = _checked(problem)
     with torch.no_grad(), full_precision(problem.poses_cw.device):
-        system = SparseProblem(problem, options)
-        move, solver = system.parts.moved, options.solver
-        outcome = levenberg_marquardt(system.state, system.linearise, system.cost, move, solver)
-        state = outcome.state
+        system: Any  # whose state is of one type or the other
+        if options.move_poses and options.solver.solver in ("auto", "direct") and is_small(problem):
+            slots = free_slots(options.fixed, len(problem.poses_cw), problem.poses_cw.device)
+            how = options.kernel, options.max_residual, options.depth_range
+            system = SmallProblem(problem, *slots, options.move_depths, *how)
+        else:
+            system = SparseProblem(problem, options)
+        outcome = levenberg_marquardt(system.state, system.linearise, system.cost, system.moved, options.solver)
+        state: Any = outcome.state
+        poses_cw, inverse_depths = system.values(state)
         if options.move_depths:
-            problem = problem.with_values(inverse_depths=state[INVERSE_DEPTHS].value[0])
-        given = problem.poses_cw.dtype
+            problem = problem.with_values(inverse_depths=inverse_depths)
         return GlobalBAResult(
-            state[POSES].value[0].to(given),
+            poses_cw.to(problem.poses_cw.dtype),
             problem.patches,
             outcome.initial_cost,
             outcome.cost,
             system.inliers(state) if unseen is None else system.inliers(state) & ~unseen,
             outcome.iterations,
             outcome.converged,
-            system.pattern.stored_blocks,
+            system.stored_blocks,
             {name: state[name].value for name in problem.blocks},
         )
 
@@ -177,7 +192,7 @@ class SparseProblem:
     """
 
     def __init__(self, problem: PatchProblem, options: GlobalBAOptions) -> None:
-        like, count = problem.poses_cw, len(problem.patches)
+        like = problem.poses_cw
         if any(block.value.dtype == torch.float64 for block in problem.blocks.values()):
             like = like.double()
         names = ("poses_cw", "patches", "intrinsics", "targets", "weights")
@@ -195,11 +210,7 @@ class SparseProblem:
             factors.insert(0, problem.reprojection(options.max_residual, None, options.kernel))
         self.state = State({POSES: poses, **further, INVERSE_DEPTHS: depths})
         self.parts, self.factors, self.moves_depths = BlockParts.of(self.state), factors, options.move_depths
-        source = torch.zeros(count, dtype=torch.long, device=problem.ii.device).index_copy_(0, problem.kk, problem.ii)
-        if bool((source[problem.kk] != problem.ii).any()):
-            raise DvoError(
-                "a patch has two source frames", field="ii", remedy="give each patch the frame it was cut of"
-            )
+        source = _sources(problem)
         self.edges: ReprojectionEdges | None = None
         if problem.sensors is None:
             frames = torch.arange(len(like), device=like.device)
@@ -228,16 +239,29 @@ class SparseProblem:
         none = [torch.zeros(0, dtype=torch.long, device=source.device)]
         return make_schur_pattern(free, source, *(torch.cat(x or none) for x in (frame, patch, pair_a, pair_b)))
 
+    @property
+    def stored_blocks(self) -> int:
+        """Blocks of the normal equations that are not zero."""
+        return self.pattern.stored_blocks
+
+    def moved(self, state: State, step: tuple[Tensor, Tensor]) -> State:
+        """The state after a step."""
+        return self.parts.moved(state, step)
+
+    def values(self, state: State) -> tuple[Tensor, Tensor]:
+        """Poses ``(N, 7)`` and inverse depths ``(K,)`` of a state."""
+        return state[POSES].value[0], state[INVERSE_DEPTHS].value[0]
+
     def cost(self, state: State) -> float:
         """Half the sum of robust squared residuals, and of what the factors give as their cost."""
         values = state.values()
-        own = self.edges.cost(*_fast_values(state)) if self.edges is not None else 0.0
+        own = self.edges.cost(*self.values(state)) if self.edges is not None else 0.0
         return own + sum(0.5 * float(factor.cost(values)[0]) for factor in self.factors)
 
     def inliers(self, state: State) -> Tensor:
         """``(E,)`` bool, edges that count."""
         if self.edges is not None:
-            return self.edges.inliers(*_fast_values(state))
+            return self.edges.inliers(*self.values(state))
         return (self.factors[0].linearise(state.values()).weight[0] > 0).any(-1)
 
     def linearise(self, state: State) -> SparseSystem:
@@ -245,7 +269,7 @@ class SparseProblem:
         pattern, zeros = self.pattern, state[POSES].value.new_zeros
         count, free = state[INVERSE_DEPTHS].value.shape[1], self.parts.count
         if self.edges is not None:
-            sums = self.edges.accumulate(*_fast_values(state), pattern, self.at)
+            sums = self.edges.accumulate(*self.values(state), pattern, self.at)
         else:
             shapes = (pattern.h_pp.count, PART, PART), (len(pattern.keys), PART), (count,), (free, PART), (count,)
             sums = tuple(map(zeros, shapes))  # type: ignore[assignment]
@@ -259,8 +283,10 @@ class SparseProblem:
         return system
 
 
-def _fast_values(state: State) -> tuple[Tensor, Tensor]:
-    return state[POSES].value[0], state[INVERSE_DEPTHS].value[0]
+def _sources(problem: PatchProblem) -> Tensor:
+    """``(K,)`` source frame of each patch."""
+    source = torch.zeros(len(problem.patches), dtype=torch.long, device=problem.ii.device)
+    return source.index_copy_(0, problem.kk, problem.ii)
 
 
 def _fast_edges(
@@ -323,6 +349,8 @@ def _checked(problem: PatchProblem) -> tuple[PatchProblem, Tensor | None]:
     check_within(problem.intrinsics[:, :2], "intrinsics, focal lengths", SHORTEST_FOCAL)
     if any(index.dtype != torch.int64 for index in indices.values()):
         problem = replace(problem, **{name: index.long() for name, index in indices.items()})
+    if bool((_sources(problem)[problem.kk] != problem.ii).any()):
+        raise DvoError("a patch has two source frames", field="ii", remedy="give each patch the frame it was cut of")
     unseen = ~(torch.isfinite(problem.targets) & (problem.targets.abs() <= LARGEST)).all(-1)
     if not bool(unseen.any()):
         return problem, None

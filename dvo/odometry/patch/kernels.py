@@ -29,12 +29,24 @@ KERNELS = {
         "f4[:,:,::1], f4[:,::1], f4[:,:,::1], f4[:,:,::1], f4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], "
         "i8[::1], i8[::1], i8[:,::1], i8[::1], i8, b1, UniTuple(f8, 7), i8, f8, f8, f8, f8, f8, i8"
     ),
+    "dvo.ba.layer.edgewise_kernels:robust_cost": (
+        "f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], i8[::1], i8[::1], i8[::1], i8[::1], "
+        "i8[:,::1], UniTuple(f8, 7), i8, b1[::1]"
+    ),
     "dvo.odometry.window.window_kernels:support": (
         "i8, b1, i8[::1], i8[::1], i8, f4[:,::1], f4[:,:,:,::1], f4[:,::1], f4[:,::1], f4[:,::1], f8, f8, f8"
     ),
     "dvo.odometry.window.window_kernels:solve_pose_kernel": (
         "f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], i8, f8, f8"
     ),
+    "dvo.ba.layer.edgewise_kernels:add_reprojection": (
+        "f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], i8[::1], i8[::1], i8[::1], i8[::1], "
+        "i8[:,::1], i8[::1], b1, UniTuple(f8, 7), i8, f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1]"
+    ),
+    "dvo.ba.layer.edgewise_kernels:solve_reduced": (
+        "f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1], f8, f8, f8[::1], f8[::1], f8[::1]"
+    ),
+    "dvo.ba.layer.edgewise_kernels:move_poses": "f8[:,::1], i8[::1], f8[::1]",
     "dvo.ba.sparse.schur_kernels:observations": "i8[::1], i8[::1], i8, i8",
     "dvo.ba.sparse.schur_kernels:find": "i8[::1], i8[::1], i8[::1], i8[::1], i8",
     "dvo.ba.sparse.edge_kernels:cost": (

@@ -24,11 +24,11 @@ LEAST_TRACKED = 0.5
 """Share of frames with a pose below which a result is doubtful."""
 CHECK_FOCAL, RUN_AGAIN = 0.2, 0.25
 """Lack of agreement, of what makes a result doubtful, above which it is asked for its focal length, and run again."""
-MAX_SHIFT_GAIN = 0.3
-"""Share of the cost of the followed corners of a pair of images that a shift explains, median over the pairs, above
-which the crop of the picture floats (:mod:`dvo.odometry.checks.floating_crop`)."""
+MAX_SHIFT_GAIN = 0.4
+"""Share of the cost of the followed corners of a pair of images that a shift explains, upper quartile of the pairs,
+above which the crop of the picture floats (:mod:`dvo.odometry.checks.floating_crop`)."""
 MOST_FIXED = 0.2
-"""Share of the image that is fixed to the camera: it takes part until it is found, so that the beginning suffers."""
+"""Share of the image that is fixed to the camera: some of it may take part, and what is left may be little."""
 WRONG_FOCAL = 0.12
 """Logarithm of the focal length that the measurements ask for over the one that is given."""
 FEWEST_CHECKS = 3
@@ -63,7 +63,8 @@ class Quality:
         deviation: median distance of the followed corners from the epipolar lines of the poses, over the median
             displacement of the corners of their pair; NaN without pairs.
         check: share of these corners within a pixel of the lines; NaN without pairs.
-        crop: share of the cost of the corners of a pair that a shift of the image explains, median; NaN with few pairs.
+        crop: share of the cost of the corners of a pair that a shift of the image explains, upper quartile of the
+            pairs; NaN with few.
         checks: number of pairs of images with followed corners.
         still: share of the frames through which followed corners hardly move though the poses do.
         jumps: number of frames between which the camera moved far more than before and after.
@@ -153,7 +154,7 @@ def judge(quality: Quality, frames: int, cause: str = "") -> tuple[Verdict, str,
     if quality.still > MOST_STILL:
         return "doubtful", f"too little of the picture moves for {quality.still:.0%} of the time", FILM
     if quality.fixed > MOST_FIXED:
-        return "doubtful", f"{quality.fixed:.0%} of the picture are fixed to the camera; found only after a while", MASK
+        return "doubtful", f"{quality.fixed:.0%} of the picture are fixed to the camera", MASK
     if quality.tracked < LEAST_TRACKED:
         return "doubtful", f"{quality.tracked:.0%} of the frames have a pose", FILM
     if quality.jumps > MOST_JUMPS * max(frames / 100, 1):

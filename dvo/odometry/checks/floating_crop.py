@@ -3,7 +3,8 @@
 Electronic stabilisation moves the part of the image that is kept, and with it the principal point. To the tracker a
 shift looks like a turn, which it nearly is; what tells them apart is the second order towards the edges of the image.
 So the motion between the two images of a pair is fitted twice to the corners, with and without a shift of the second
-image. Of a camera whose principal point stays, the shift takes away little of the robust cost of most pairs.
+image. Of a camera whose principal point stays, the shift takes away little of the robust cost that is above the noise
+of the corners. A wrong trajectory is no start for both fits: they begin in three directions of the translation.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ MAX_PAIRS = 32
 """Pairs that are looked at, evenly over the sequence."""
 
 _SCALE = 0.5  # of the robust kernel, pixels
+_NOISE = 0.1  # of a corner, pixels: of a slow camera nothing but that is left, and a shift may explain it
+_SHARE = 0.75  # of the pairs have at most the gain that counts: a crop that floats comes back, and is still at times
 _ITERATIONS = 12
 _STEP = 1e-5  # of the numeric derivatives, radians
 _TOLERANCE = 1e-3  # relative decrease of the cost below which a fit has converged
@@ -31,7 +34,9 @@ _STRONGEST = 1e8  # damping beyond which no step helps
 
 
 def shift_gain(pairs: Sequence[CheckPair], motions: Sequence[np.ndarray]) -> float:
-    """Share of the cost of the corners of a pair that a shift of the second image takes away, median over the pairs.
+    """Share of the cost of the corners of a pair that a shift of the second image takes away, their upper quartile.
+
+    The cost of the noise counts as one that no shift takes away.
 
     Args:
         pairs: their corners as a global shutter would have seen them.
@@ -43,8 +48,8 @@ def shift_gain(pairs: Sequence[CheckPair], motions: Sequence[np.ndarray]) -> flo
     gains = []
     for at in looked_at(pairs):
         plain, shifted = (fitted_cost(pairs[at], motions[at], with_shift) for with_shift in (False, True))
-        gains.append(max(1 - shifted / plain, 0.0) if plain > 0 else 0.0)
-    return float(np.median(gains)) if gains else math.nan
+        gains.append(max(plain - shifted, 0.0) / (plain + _NOISE**2 * len(pairs[at].points)))
+    return float(np.quantile(gains, _SHARE)) if gains else math.nan
 
 
 def looked_at(pairs: Sequence[CheckPair]) -> list[int]:
@@ -67,7 +72,8 @@ def fitted_cost(pair: CheckPair, motion: np.ndarray, with_shift: bool) -> float:
 
     Args:
         pair: the corners.
-        motion: ``(4, 4)`` to begin with; only the direction of its translation counts.
+        motion: ``(4, 4)`` to begin with. Of its translation the direction counts, and as it may be wrong, each fit
+            begins there and in two directions across.
         with_shift: the second image may be shifted.
 
     Returns:
@@ -81,12 +87,19 @@ def fitted_cost(pair: CheckPair, motion: np.ndarray, with_shift: bool) -> float:
     )
     length = float(np.linalg.norm(motion[:3, 3]))
     towards = motion[:3, 3] / length if length > 1e-12 else np.array([1.0, 0.0, 0.0])
-    aside = np.linalg.svd(towards[None])[2][1:]
+    across = np.linalg.svd(towards[None])[2][1:]
+    return min(_fitted(first, second, motion[:3, :3], way, scale, with_shift) for way in (towards, *across))
 
+
+def _fitted(
+    first: np.ndarray, second: np.ndarray, rotation: np.ndarray, towards: np.ndarray, scale: float, with_shift: bool
+) -> float:
+    """Robust cost from one start; rays ``(N, 3)``, and the scale of the kernel on their plane."""
+    aside = np.linalg.svd(towards[None])[2][1:]
     if available():
         from dvo.odometry.checks import fit_kernels
 
-        values = first[:, :2].copy(), second[:, :2].copy(), motion[:3, :3].copy(), towards.copy(), aside.copy()
+        values = first[:, :2].copy(), second[:, :2].copy(), rotation.copy(), towards.copy(), aside.copy()
         limits = scale, _SCALE, _ITERATIONS, _STEP, _TOLERANCE, _STRONGEST
         return float(fit_kernels.fit(*values, 7 if with_shift else 5, *limits))
     moving = np.arange(7) < (7 if with_shift else 5)
@@ -94,7 +107,7 @@ def fitted_cost(pair: CheckPair, motion: np.ndarray, with_shift: bool) -> float:
 
     def residuals(x: np.ndarray) -> np.ndarray:
         """``(X, N)`` for ``(X, 7)``: turn, direction, shift."""
-        turn = _turns(x[:, :3]) @ motion[:3, :3]
+        turn = _turns(x[:, :3]) @ rotation
         direction = towards + x[:, 3:5] @ aside
         tx, ty, tz = (direction / np.linalg.norm(direction, axis=1, keepdims=True)).T
         zero = np.zeros_like(tx)

@@ -11,6 +11,7 @@ import torch
 from dvo.odometry.checks.check_pairs import CheckPairs
 from dvo.odometry.frames.fixed_pixels import FixedPixels
 from dvo.odometry.frames.front_end import View
+from dvo.odometry.frames.gate import Admitted
 from dvo.odometry.global_ba.rolling_shutter import Shutter
 from dvo.odometry.patch.map_tables import MapTable
 from dvo.odometry.protocol import Estimate
@@ -63,6 +64,7 @@ class TrackerState:
         info: metadata for run.json.
         fixed: pixels that are fixed to the images.
         hidden: share of the last image that they are, without those of a given mask.
+        beginning: frames of the recording, as long as it may begin anew; None after that.
         checks: measurements that take no part in the trajectory.
         started: timestamp of the first measured pose, seconds; None before it.
         quality: of the result, after ``finish``.
@@ -86,6 +88,7 @@ class TrackerState:
     map: MapTable | None = None
     fixed: FixedPixels = field(default_factory=FixedPixels)
     hidden: float = 0.0
+    beginning: list[Admitted] | None = field(default_factory=list)
     checks: CheckPairs = field(default_factory=CheckPairs)
     started: float | None = None
     quality: Quality | None = None

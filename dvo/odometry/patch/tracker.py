@@ -57,6 +57,9 @@ from dvo.odometry.window.sensors import WINDOW_SENSORS, WindowSensor
 
 LOOK_EVERY = 3
 """Aligned frames in a row, of which one is looked at for pixels that are fixed to the images."""
+BEGINNING, MOST_HELD = 64, 0.02
+"""Frames within which a recording begins anew where more than this share of the image is found to be fixed to it: what
+was measured there holds poses and scale of the frames before."""
 
 
 @exclusive
@@ -163,16 +166,43 @@ class PatchOdometry:
                 self.inertial.add(admitted.frame.inertial)
             if self.inertial.active:
                 self.patch_window.sensors = *self.sensors, self.inertial.coupling
-            state.shutter = Shutter(admitted.camera.readout, admitted.camera.height / self.model.config.STRIDE)
             if state.map is not None:
+                state.beginning = None
                 begin_in_map(self.graph, self.loops.finder, state)
-            record = self.graph.log.add(admitted.timestamp)
-            if admitted.repeated:
-                estimate = self._repeat(record)
-            else:
-                estimate = self._lose(record, admitted.problem) if admitted.problem else self._measure(record, admitted)
-            state.last = estimate
-            return self.inertial.express(record, estimate) if self.inertial.active else estimate
+            self._remember(admitted)
+            return self._process(admitted)
+
+    def _process(self, admitted: Admitted) -> Estimate:
+        """Process a frame that has passed the gate."""
+        state = self.state
+        state.shutter = Shutter(admitted.camera.readout, admitted.camera.height / self.model.config.STRIDE)
+        record = self.graph.log.add(admitted.timestamp)
+        if admitted.repeated:
+            estimate = self._repeat(record)
+        else:
+            estimate = self._lose(record, admitted.problem) if admitted.problem else self._measure(record, admitted)
+        self.state.last = estimate
+        return self.inertial.express(record, estimate) if self.inertial.active else estimate
+
+    def _remember(self, admitted: Admitted) -> None:
+        """Keep a frame at the beginning of a recording; with other sensors, and in real time, none begins anew."""
+        beginning, scale = self.state.beginning, self.config.scale
+        others = self.sensors or self.inertial.active or scale.depth or scale.stereo
+        if beginning is None or others or self.config.real_time or len(beginning) == BEGINNING:
+            self.state.beginning = None
+            return
+        image, mask = admitted.image.copy(), None if admitted.mask is None else admitted.mask.copy()  # may be buffers
+        frame = Frame(admitted.frame.index, admitted.timestamp, image, admitted.camera)
+        beginning.append(replace(admitted, frame=frame, image=image, mask=mask))
+
+    def _begin_anew(self) -> Estimate:
+        """Process the frames so far again, now that it is known what is fixed to the images."""
+        frames, gate, fixed = self.state.beginning or [], self.gate, self.state.fixed
+        self.reset()
+        self.gate, self.state.fixed, self.state.beginning = gate, fixed, None
+        for admitted in frames:
+            estimate = self._process(admitted)
+        return estimate
 
     def _measure(self, record: FrameRecord, admitted: Admitted) -> Estimate:
         """Process a frame with content."""
@@ -180,6 +210,8 @@ class PatchOdometry:
         if admitted.gap:
             state.interrupt(str(admitted.gap), is_gap=not admitted.gap.frozen)
         mask = self._without_fixed(image, admitted.mask)
+        if state.beginning is not None and state.hidden > MOST_HELD:
+            return self._begin_anew()
         if estimate := self._align(record, admitted, mask):
             return estimate
         if self.aligner is not None:

@@ -55,6 +55,18 @@ def test_the_cost_is_that_of_the_true_motion_wherever_the_fit_begins():
     assert near == pytest.approx(far, rel=1e-3) and near < 100 * 0.1**2
 
 
+def test_a_translation_that_is_wrong_is_as_good_a_start():
+    pairs, motions = zip(*(pair(seed, (5.0, 6.0)) for seed in range(8)), strict=True)
+    across = [motion.copy() for motion in motions]
+    for motion in across:
+        motion[:3, 3] = np.linalg.svd(motion[None, :3, 3])[2][1]
+    assert shift_gain(pairs, across) == pytest.approx(shift_gain(pairs, motions), abs=0.05)
+
+
+def test_a_shift_below_the_noise_of_corners_is_none():
+    assert gain((0.15, 0.0), noise=0.01, outliers=0.0) < 0.1
+
+
 def test_too_few_pairs_or_corners_say_nothing():
     assert np.isnan(gain((8.0, 0.0), seeds=range(MIN_PAIRS - 1)))
     assert np.isnan(gain((8.0, 0.0), count=20))

@@ -29,7 +29,7 @@ FORWARD: tuple[tuple[str, Any, str], ...] = (
     ("correlation volume", correlation.CorrelationVolume, "__init__"),
     ("correlation look-up", correlation.CorrelationVolume, "lookup"),
     ("update operator", Update, "forward"),
-    ("bundle adjustment", step_module, "solve"),
+    ("bundle adjustment", step_module, "dense_solution"),
     ("reprojection", step_module, "reproject"),
 )
 LOSS: tuple[tuple[str, Any, str], ...] = (

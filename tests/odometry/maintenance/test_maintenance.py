@@ -63,7 +63,7 @@ def test_steps_are_taken_with_the_frames():
 @pytest.mark.parametrize("cores, thread", [(1, False), (2, True)])
 def test_the_thread_takes_steps_ahead_if_it_has_a_core(monkeypatch, cores, thread):
     """The result is taken at the same frame, and at once where it is waited for."""
-    monkeypatch.setattr("dvo.core.threads.available_cores", lambda: cores * torch.get_num_threads())
+    monkeypatch.setattr("dvo.core.context.available_cores", lambda: cores * torch.get_num_threads())
     maintenance, owner, found, where = MapMaintenance(steps=2), Owner(), [], []
 
     def steps():
@@ -85,7 +85,7 @@ def test_the_thread_takes_steps_ahead_if_it_has_a_core(monkeypatch, cores, threa
 
 def test_the_thread_helps_if_it_has_a_core_and_no_job(monkeypatch):
     cores = [torch.get_num_threads() + 1]
-    monkeypatch.setattr("dvo.core.threads.available_cores", lambda: cores[0])
+    monkeypatch.setattr("dvo.core.context.available_cores", lambda: cores[0])
     maintenance = MapMaintenance()
     assert maintenance.helper(threading.get_ident).result() != threading.get_ident()
     maintenance.job = maintenance.beside("correction", lambda: None, lambda _: {}, 1)

@@ -25,6 +25,8 @@ GAPS = (4, 32)
 DISPLACEMENTS = (2.0, 6.0, 20.0)
 """Median displacements of the corners of a pair, pixels: below the first they tell nothing and the second image is a
 later one; the gap grows below the second, and shrinks above the third."""
+WINDOW = (15, 15)
+"""Pixels around a corner by which it is followed."""
 RETURN = 0.4
 """Largest distance of a corner from where it was, followed forward and back, pixels."""
 
@@ -103,12 +105,13 @@ def followed(first: np.ndarray, second: np.ndarray, mask: np.ndarray | None = No
     Returns:
         ``(N, 4)`` float32 x, y in the first and in the second image.
     """
-    valid = None if mask is None else mask.astype(np.uint8)
+    # A window that reaches beyond the mask follows what is there: the edge of a bonnet stands still.
+    valid = None if mask is None else cv2.erode(mask.astype(np.uint8), np.ones(WINDOW, np.uint8))
     corners = cv2.goodFeaturesToTrack(first, CORNERS, 0.01, 8, mask=valid)
     if corners is None:
         return np.zeros((0, 4), np.float32)
-    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, np.zeros_like(corners), winSize=(15, 15))
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(second, first, there, np.zeros_like(corners), winSize=(15, 15))
+    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, np.zeros_like(corners), winSize=WINDOW)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(second, first, there, np.zeros_like(corners), winSize=WINDOW)
     near = np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < RETURN
     kept = near & (found.ravel() > 0) & (returned.ravel() > 0)
     return np.concatenate([corners.reshape(-1, 2), there.reshape(-1, 2)], axis=1)[kept]

@@ -57,6 +57,18 @@ def test_corners_move_as_the_picture_does(wall):
     assert (followed(a, b, half)[:, 0] >= 79).all()
 
 
+def test_no_corner_stands_still_with_the_rim_of_the_mask(wall):
+    a, b = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in film(wall, 2, 7))
+    bonnet = np.ones(a.shape, bool)
+    for x in range(0, a.shape[1], 16):  # a rim with many corners
+        bonnet[70 + x % 32 :, x : x + 16] = False
+    faint = [np.where(bonnet, 100 + image // 8, 20).astype(np.uint8) for image in (a, b)]
+    points = followed(*faint, bonnet)
+    assert len(points) >= MIN_CORNERS
+    far = np.abs(points[:, 2:] - points[:, :2] - [-7, 0]).max(1)
+    assert (far < 1).mean() > 0.9
+
+
 def test_the_gap_follows_the_motion(wall):
     """Fast motion has pairs of neighbours, slow motion those that are further apart; a still camera has none."""
     fast, slow, still = (pairs_of(film(wall, 60, step)) for step in (12, 0.6, 0))

@@ -238,7 +238,7 @@ def rotations_first(problem: PatchProblem, options: GlobalBAOptions) -> PatchPro
     """
     poses = se3.identity(len(problem.poses_cw), dtype=problem.poses_cw.dtype)
     far = _at(problem, poses, torch.full_like(problem.inverse_depths, _FAR))
-    turned = solve(far, BAOptions(motion_only=True, iterations=4, check=False)).poses_cw
+    turned = solve(far, BAOptions(motion_only=True, iterations=4)).poses_cw
     return _cold(problem, torch.cat([torch.zeros_like(turned[:, :3]), turned[:, 3:]], 1))
 
 
@@ -260,7 +260,8 @@ def _at(problem: PatchProblem, poses_cw: Tensor, inverse_depths: Tensor) -> Patc
 def _cold(problem: PatchProblem, poses_cw: Tensor) -> PatchProblem:
     now = _at(problem, poses_cw, torch.ones_like(problem.inverse_depths))
     for update in range(_COLD_UPDATES):
-        result = solve(now, BAOptions(damping=damping_at(update), check=False))
+        # What is wrong with a problem is found by the first of them.
+        result = solve(now, BAOptions(damping=damping_at(update), check=None if update == 0 else False))
         now = now.with_values(poses_cw=result.poses_cw, patches=result.patches)
     found = now.poses_cw.to(problem.poses_cw)
     moved = se3.compose(found, problem.poses_cw[:1].expand_as(found))

@@ -21,6 +21,7 @@ from dvo.ba.multistart import (
     present,
 )
 from dvo.ba.patch_problem import PatchProblem
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 
@@ -166,3 +167,12 @@ def test_starts_are_positive_and_keep_the_median():
         values = start(problem, OPTIONS).inverse_depths
         assert (values > 0).all() and values.median() == pytest.approx(float(median), rel=0.05)
     assert (equal_depths(problem, OPTIONS).inverse_depths == median).all()
+
+
+@pytest.mark.parametrize("start", COLD_STARTS)
+@pytest.mark.parametrize("name", ["kk", "jj"])
+def test_a_problem_with_an_index_out_of_range_is_refused(start, name):
+    _, problem = scene(0)
+    wrong = problem.with_values(**{name: getattr(problem, name) + 1000})
+    with pytest.raises(DvoError, match=name):
+        multistart(wrong, {start: COLD_STARTS[start]}, AS_THEY_ARE)

@@ -146,6 +146,17 @@ def test_a_recording_begins_anew_without_the_pixels_that_are_found_to_be_fixed()
     assert len(poses[0]) == len(given) and poses[0].tobytes() == poses[1].tobytes()
 
 
+def test_no_more_of_large_images_is_kept_than_memory_allows(monkeypatch):
+    odometry, kept = tracker(), []
+    for frame in frames(6)[:6]:
+        odometry.track(frame)
+        beginning = odometry.state.beginning
+        kept.append(None if beginning is None else len(beginning))
+        if len(kept) == 1:
+            monkeypatch.setattr("dvo.odometry.patch.tracker.MOST_KEPT", 4 * beginning[0].image.nbytes)
+    assert kept == [1, 2, 3, 4, None, None]
+
+
 def test_fixed_pixels_that_leave_too_little_are_used():
     """As many as all: the frames are not lost for it, and nothing is reported as left out."""
     odometry = tracker()

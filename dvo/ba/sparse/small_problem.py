@@ -152,4 +152,5 @@ class SmallProblem:
         coupled = np.eye(len(self.rows), dtype=np.bool_)
         coupled[ii, jj] = coupled[jj, ii] = True
         moves = self.rows >= 0
-        return int(seen[:, moves].sum() + np.tril(coupled[moves][:, moves]).sum())
+        pairs = int(coupled[moves][:, moves].sum()) + self.free  # each twice, but for the diagonal
+        return int(seen[:, moves].sum()) + pairs // 2

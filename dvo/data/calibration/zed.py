@@ -22,6 +22,7 @@ _SIZES = {"4K": (3840, 2160), "QHDPLUS": (3200, 1800), "2K": (2208, 1242), "FHD1
           "HD1200": (1920, 1200), "HD1080": (1920, 1080), "HD": (1280, 720), "HD720": (1280, 720), "SVGA": (960, 600),
           "VGA": (672, 376)}  # fmt: skip
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_LENS = {"fx", "fy", "cx", "cy", *_COEFFICIENTS}
 _REMEDY = "download it again, or write 'fx fy cx cy [k1 k2 p1 p2 [k3]]' of a section on one line"
 _NOTE = "the calibration is that of the images of a ZED as recorded; those that its SDK has rectified have another one"
 
@@ -78,6 +79,8 @@ def _numbers(body: str, path: Path) -> dict[str, float]:
         try:
             number = float(text)
         except ValueError:
+            if key.lower() in _LENS:
+                raise DvoError(f"no number: {text[:40]!r}", file=path, field=key, remedy=_REMEDY) from None
             continue  # of no camera
         if key.lower() in values:
             raise DvoError("twice in a section", file=path, field=key, remedy=_REMEDY)

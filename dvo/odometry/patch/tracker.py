@@ -60,6 +60,8 @@ LOOK_EVERY = 3
 BEGINNING, MOST_HELD = 64, 0.02
 """Frames within which a recording begins anew where more than this share of the image is found to be fixed to it: what
 was measured there holds poses and scale of the frames before."""
+MOST_KEPT = 2**27
+"""Bytes of images that are kept for that; of larger images fewer frames are."""
 
 
 @exclusive
@@ -188,7 +190,8 @@ class PatchOdometry:
         """Keep a frame at the beginning of a recording; with other sensors, and in real time, none begins anew."""
         beginning, scale = self.state.beginning, self.config.scale
         others = self.sensors or self.inertial.active or scale.depth or scale.stereo
-        if beginning is None or others or self.config.real_time or len(beginning) == BEGINNING:
+        full = beginning is not None and len(beginning) >= min(BEGINNING, MOST_KEPT // max(admitted.image.nbytes, 1))
+        if beginning is None or others or self.config.real_time or full:
             self.state.beginning = None
             return
         image, mask = admitted.image.copy(), None if admitted.mask is None else admitted.mask.copy()  # may be buffers

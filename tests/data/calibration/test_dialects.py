@@ -760,6 +760,8 @@ REFUSED = [
     ("SN.conf", ZED.format("") + ZED.format("").replace("_HD", "_VGA"), "4 cameras in it: 0: LEFT_CAM_HD"),
     ("SN.conf", "[LEFT_CAM_CAM_HD]\nfx=1\n", "no fx, fy, cx, cy in it"),
     ("SN.conf", ZED.format("k1=.1\nk1=.2"), "k1: twice"),
+    ("SN.conf", ZED.format("k1=0,1"), "k1: no number: '0,1'"),
+    ("SN.conf", ZED.format("") + "[LEFT_DISTO]\nk1=0.1\np1=?\n", "p1: no number"),
     ("SN.conf", ZED.format("") + "[LEFT_DISTO]\nk1=1\nk2=2\nk3=3\nk4=4\n", "may be that of a fisheye"),
     ("SN.conf", ZED.format("").replace("fx=700", ""), "no fx, fy, cx, cy in it"),
     ("a.xml", METASHAPE.format("frame", "<k4>0.1</k4>"), "a camera of type frame of dvo has no k4"),

@@ -34,7 +34,8 @@ def compressed_video(images: np.ndarray, crf: int) -> np.ndarray:
     encode = [*command, *raw, "-r", "30", "-i", "-", "-c:v", "libx264", "-preset", "veryfast", "-threads", "1",
               "-crf", str(crf), "-g", str(LENGTH), "-bf", "0", "-pix_fmt", "yuv420p", "-f", "h264", "-"]  # fmt: skip
     code = _output(encode, even.tobytes())
-    decode = [*command, "-f", "h264", "-i", "-", *raw, "-"]
+    # older programs read this stream at 25 frames a second, and repeat frames to write 30
+    decode = [*command, "-f", "h264", "-framerate", "30", "-i", "-", "-r", "30", *raw, "-"]
     pixels = _output(decode, code)
     return np.frombuffer(pixels, np.uint8).reshape(even.shape)[:, :rows, :columns].copy()
 

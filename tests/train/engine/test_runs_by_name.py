@@ -158,7 +158,8 @@ def test_fine_tuning_as_the_readme_says(fit, capsys):
     text = (ROOT / "docs" / "training.md").read_text(encoding="utf-8")
     block = next(block for block in text.split("```bash\n")[1:] if "--name tuned" in block).split("```")[0]
     lines = block.replace("\\\n", " ").strip().splitlines()
-    training, exporting = (line.removeprefix("python -m train ").split() for line in lines)
+    commands = [line.split("#")[0].removeprefix("python -m train ").split() for line in lines]
+    training, exporting = (next(words for words in commands if words[0] == verb) for verb in ("fit", "export"))
     training[training.index("DIR")] = str(data_root() / "tartanair_v2_10")
     training[training.index("--steps") + 1] = "1"
     training = [str(ROOT / word) if word.startswith(("configs/", "train/")) else word for word in training]

@@ -144,6 +144,20 @@ def standardise_whole(images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 H 
     return centred * torch.rsqrt(variance + _NOISE)
 
 
+def local_contrast(images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n 1 H W"]:
+    """Grey values less the mean of their surroundings, over its deviation: faint texture counts beside strong edges.
+
+    Args:
+        images: normalised images. The surroundings are about 20 pixels wide; noise below a grey level is not raised.
+    """
+    grey = images.mean(1, keepdim=True)
+    coarse = F.avg_pool2d(torch.cat([grey, grey.square()], 1), 4, ceil_mode=True)
+    around = F.avg_pool2d(coarse, 5, stride=1, padding=2, count_include_pad=False)
+    around = F.interpolate(around, scale_factor=4.0, mode="bilinear", align_corners=False)
+    mean, square = around[..., : images.shape[2], : images.shape[3]].split(1, 1)
+    return (grey - mean) * torch.rsqrt((square - mean.square()).clamp(min=0) + _NOISE)
+
+
 class WideBlock(nn.Module):
     """Depthwise 5x5 convolution, two 1x1 convolutions with twice the channels between them, and a skip (ConvNeXt's
     order; nothing is normalised).
@@ -178,13 +192,14 @@ class LightEncoder(_StrideFour):
     Args:
         stem, trunk: channels at 1/2 and 1/4 of the image resolution.
         outputs: channels of the features.
-        norm: ``"instance"`` for images standardised as a whole, anything else for images as they are.
+        norm: ``"instance"`` for images standardised as a whole and beside them their local contrast, anything else for
+            images as they are.
     """
 
     def __init__(self, stem: int, trunk: int, outputs: int, norm: str) -> None:
         super().__init__()
         self.standardised = norm == "instance"
-        self.conv1 = nn.Conv2d(3, stem, 5, stride=2, padding=2)
+        self.conv1 = nn.Conv2d(3 + self.standardised, stem, 5, stride=2, padding=2)
         self.down = nn.Conv2d(stem, trunk, 3, stride=2, padding=1)
         blocks = [WideBlock(trunk) for _ in range(3)]
         self.blocks = nn.Sequential(*blocks)
@@ -197,7 +212,9 @@ class LightEncoder(_StrideFour):
 
     def stem(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n s H2 W2"]:
         """Layer at half of the image resolution, see :meth:`Encoder.stem`."""
-        return F.relu(self.conv1(standardise_whole(images) if self.standardised else images))
+        if self.standardised:
+            images = torch.cat([standardise_whole(images), local_contrast(images)], 1)
+        return F.relu(self.conv1(images))
 
     def trunk(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n t h w"]:
         """See :meth:`_StrideFour.trunk`."""

@@ -11,7 +11,7 @@ from dvo.core.errors import DvoError
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import load_weights, save_weights
 from dvo.nets.patch.config import ModelConfig, preset
-from dvo.nets.patch.encoder import Encoder, LightEncoder, standardise_whole
+from dvo.nets.patch.encoder import Encoder, LightEncoder, local_contrast, standardise_whole
 from dvo.nets.patch.patchifier import ENCODERS
 
 SIZE, PLACE = (160, 192), (20, 24)
@@ -75,6 +75,23 @@ def test_standardised_images():
     assert (standardise_whole(torch.full((1, 3, 8, 8), 0.3)).abs() < 1e-3).all()
     dark = standardise_whole(torch.rand(1, 3, 20, 30) * 1e-3)
     assert dark.std() < 0.1
+
+
+def test_faint_texture_beside_a_bright_window_has_the_contrast_of_strong_texture():
+    torch.manual_seed(0)
+    texture = torch.randn(1, 1, 64, 96).expand(1, 3, 64, 96)
+    images = torch.cat([0.05 * texture[..., :48] - 0.3, 0.5 * texture[..., 48:] + 0.9], -1)
+    found = local_contrast(images)
+    faint, strong = found[..., 12:-12, 12:30].std(), found[..., 12:-12, 66:84].std()
+    assert found.shape == (1, 1, 64, 96) and 0.8 < faint < 1.2 and 0.8 < strong < 1.2
+    assert local_contrast(torch.full((2, 3, 61, 50), 0.7)).abs().max() < 1e-3
+
+
+def test_local_contrast_of_a_part_is_that_of_the_whole():
+    torch.manual_seed(0)
+    images = torch.randn(1, 3, 96, 96)
+    part = local_contrast(images[..., 8:, 16:])  # shifted by cells of four pixels, its borders away from them
+    torch.testing.assert_close(part[..., 24:, 24:], local_contrast(images)[..., 32:, 40:], atol=1e-5, rtol=1e-5)
 
 
 # -- sizes and weights -------------------------------------------------------------------------------------------------

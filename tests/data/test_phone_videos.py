@@ -150,22 +150,51 @@ def test_sound_is_ignored(tmp_path, order):
     assert all(np.array_equal(a.image, b.image) for a, b in zip(frames, silent, strict=True))
 
 
-@pytest.mark.parametrize("clockwise", [90, 180, 270])
-def test_turned(tmp_path, clockwise):
-    upright = encode(tmp_path / "v.mp4", *FORMS["h264.mp4"])
-    file = tmp_path / "turned.mp4"
-    ffmpeg("-display_rotation", -clockwise, "-i", upright, "-c", "copy", file)  # its angles are counter-clockwise
-    source = open_source(file, calib=CALIB if clockwise == 180 else PORTRAIT)
-    assert source.turned == clockwise
-    frames = list(source)
-    assert max(differences(frames, [np.rot90(image, -clockwise // 90) for image in PICTURES])) < 3
+@pytest.mark.parametrize("container", ["mp4", "mov", "mkv", "webm"])
+@pytest.mark.parametrize("flip", [None, "-display_hflip", "-display_vflip"])
+def test_turned_and_mirrored(tmp_path, container, flip):
+    """Frames are what ffmpeg shows; OpenCV's own turning takes mirrored frames for others."""
+    codec = ("-c:v", "libvpx", "-crf", 4, "-b:v", "4M") if container == "webm" else FORMS["h264.mp4"]
+    plain = encode(tmp_path / f"plain.{container}", *codec)
+    for clockwise in (0, 90, 180, 270):
+        file = tmp_path / f"{clockwise}.{container}"
+        turning = ("-display_rotation", -clockwise, *([flip] if flip else []))  # its angles are counter-clockwise
+        ffmpeg(*turning, "-i", plain, "-c", "copy", file)
+        ffmpeg("-i", file, "-frames:v", 1, tmp_path / "shown.png")
+        shown = cv2.cvtColor(cv2.imread(str(tmp_path / "shown.png")), cv2.COLOR_BGR2RGB)
+        source = open_source(file, calib=PORTRAIT if clockwise in (90, 270) else CALIB)
+        frame = next(iter(source)).image
+        assert frame.shape == shown.shape and np.abs(frame.astype(float) - shown).mean() < 3
+        assert ["mirror" in warning for warning in source.warnings] == [True] * (flip is not None)
+        assert flip or source.turned == clockwise
 
 
-def test_a_mirrored_video_is_told(tmp_path):
-    plain, file = encode(tmp_path / "v.mp4", *FORMS["h264.mp4"]), tmp_path / "mirrored.mp4"
-    assert open_source(plain, calib=CALIB).warnings == []
-    ffmpeg("-display_vflip", "-i", plain, "-c", "copy", file)
-    assert ["mirrored" in warning for warning in open_source(file, calib=CALIB).warnings] == [True]
+def spherical(version):
+    """The box by which a track says that it shows all around: Google's first version, in XML, and the second."""
+
+    def box(kind, content):
+        return (len(content) + 8).to_bytes(4) + kind + content
+
+    if version == 1:
+        return box(b"uuid", bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + b"<rdf:SphericalVideo/>")
+    projection = box(b"proj", box(b"prhd", bytes(16)) + box(b"equi", bytes(20)))
+    return box(b"sv3d", box(b"svhd", bytes(5)) + projection)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_videos_that_show_all_around_are_said(tmp_path, version):
+    file = encode(tmp_path / "v.mp4", *FORMS["h264.mp4"])
+    data, box = bytearray(file.read_bytes()), spherical(version)
+    around = [b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1"][: 2 if version == 1 else 7]
+    places = [data.index(name, data.index(b"moov")) - 4 for name in around]
+    end = places[-1] + int.from_bytes(data[places[-1] : places[-1] + 4])
+    for at in places:  # the index follows the frames, whose places stay
+        data[at : at + 4] = (int.from_bytes(data[at : at + 4]) + len(box)).to_bytes(4)
+    file.write_bytes(data[:end] + box + data[end:])
+    with pytest.raises(DvoError, match="show all around.*v360=e:flat"):
+        open_source(file, guess=True)
+    source = open_source(file, calib=CALIB)
+    assert len(list(source)) == COUNT and "show all around" in " ".join(source.warnings)
 
 
 def test_trimmed_videos_are_whole_and_cut_ones_are_not(tmp_path):

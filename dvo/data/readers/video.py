@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -25,11 +25,13 @@ from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
 from dvo.data.images.fields import DEINTERLACE, INTERLACED, LOOKED_AT, are_interlaced
 from dvo.data.images.image_header import MAX_PIXELS
 from dvo.data.images.images import SUFFIXES, to_rgb8
+from dvo.data.images.orientation import MIRRORED, mirrors, oriented, turn
 from dvo.data.inertial import InertialSamples
 from dvo.data.inertial_files.gopro import gopro_notes, read_gopro, read_gopro_positions
 from dvo.data.inertial_files.gpmf import has_telemetry
 from dvo.data.positions import Positions
-from dvo.data.readers.edit_list import is_mirrored, shown_seconds
+from dvo.data.readers.avi_index import is_misindexed
+from dvo.data.readers.container import is_sphere, orientation, shown_seconds
 from dvo.data.recording import EVERYTHING, Log, RawFrame, Reader, Recording, Request, Selection
 from dvo.data.trajectory import Trajectory
 
@@ -68,18 +70,8 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
         raise DvoError("a text file is no video", file=path, remedy="give a video or the folder that holds the images")
     if path.suffix.lower() in SUFFIXES:  # FFmpeg would read it as a video of one frame
         raise DvoError("one image is no video", file=path, remedy="give the folder that holds the images")
-    # FFmpeg reports every damaged block on stderr, thousands of lines in one bad video; we count frames instead
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(0)
-    try:
-        # FFmpeg only: OpenCV's other backends would read foo_01.png as a video of all its siblings
-        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 1000 * _SECONDS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1000 * _SECONDS]
-        with spelled_in_text(path) as name:
-            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, limits)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-    try:
+    with ExitStack() as opened:
+        capture = _open(path, opened)
         if not capture.isOpened() and (other := _no_video(path, head)) is not None:
             raise DvoError(f"{other} is no video", file=path, remedy="give a video or the folder that holds the images")
         if not capture.isOpened():
@@ -93,13 +85,38 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
         if size[0] * size[1] > MAX_PIXELS:
             message = f"frames of {size[0]:g}x{size[1]:g} pixels, more than {MAX_PIXELS:,}"
             raise DvoError(message, file=path, remedy="reduce the video")
-        yield capture
-    except cv2.error as error:
-        raise DvoError(
-            f"this video does not decode ({str(error).splitlines()[0][:200]})", file=path, remedy="check that it plays"
-        ) from None
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # it does not mirror, and turns by a wrong angle where it should
+        try:
+            yield capture
+        except cv2.error as error:
+            reason = str(error).splitlines()[0][:200]
+            raise DvoError(f"this video does not decode ({reason})", file=path, remedy="check that it plays") from None
+
+
+def _open(path: Path, opened: ExitStack) -> cv2.VideoCapture:
+    """A video that is closed with the stack, and that may not have been opened."""
+    import cv2
+
+    # FFmpeg reports every damaged block on stderr, thousands of lines in one bad video; we count frames instead
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(0)
+    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 1000 * _SECONDS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1000 * _SECONDS]
+    try:
+        with spelled_in_text(path) as name:
+            if is_in_order := is_misindexed(path):  # of a pipe FFmpeg reads no index, but chunk after chunk
+                number = os.open(path, os.O_RDONLY)
+                opened.callback(os.close, number)
+                name = f"pipe:{number}"
+            # FFmpeg only: OpenCV's other backends would read foo_01.png as a video of all its siblings
+            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, limits)
     finally:
-        capture.release()
+        cv2.utils.logging.setLogLevel(level)
+    if is_in_order and not capture.isOpened():
+        remedy = f"write it anew: ffmpeg -i - -c copy OUT.avi < {path.name}"
+        raise DvoError("the index of the video is damaged", file=path, remedy=remedy)
+    opened.callback(capture.release)
+    return capture
 
 
 def _no_video(path: Path, head: bytes) -> str | None:
@@ -205,11 +222,12 @@ class VideoRecording:
 
     Attributes:
         rate: frames a second that the file states, or the user; None with a list of times.
-        turned: degrees by which frames are turned to stand upright, as the file asks for; their rows are then not the
-            rows of the sensor in the order in which it reads them.
+        orientation: of EXIF, by which frames are turned and mirrored, as the file asks for.
+        turned: degrees clockwise of it; rows are then not the rows of the sensor in the order in which it reads them.
 
     Raises:
-        DvoError: it does not open, holds no frame, or ``times`` has another number of rows than it has frames.
+        DvoError: it does not open, holds no frame, shows all around without a calibration, or ``times`` has another
+            number of rows than it has frames.
     """
 
     kind = "video"
@@ -230,9 +248,10 @@ class VideoRecording:
         with _capture(path) as capture:
             announced, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
             angle = capture.get(cv2.CAP_PROP_ORIENTATION_META) % 360
-            does_turn = capture.get(cv2.CAP_PROP_ORIENTATION_AUTO) and angle in (90, 180, 270)
-            self.turned = int(angle) if does_turn else 0
-            width, height = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+            self.orientation = orientation(path) or {90: 6, 180: 3, 270: 8}.get(angle, 1)
+            self.turned = turn(self.orientation)
+            size = [capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+            width, height = reversed(size) if self.orientation > 4 else size
             self._square = _square_size(width, height, _aspect(capture), self.turned, request.calibration)
             first, interlaced = self._look(capture)
         if not first:
@@ -246,8 +265,15 @@ class VideoRecording:
             self.warnings.append(
                 f"the pixels of the video are not square: images of {width:g}x{height:g} are resized to {wide}x{high}"
             )
-        if is_mirrored(path):
-            self.warnings.append("the file asks for mirrored frames, as of a front camera: they are not mirrored")
+        self.warnings += [MIRRORED] * mirrors(self.orientation)
+        if is_misindexed(path):
+            self.warnings.append("the index of the file is damaged: frames are read in the order in which they lie")
+        if is_sphere(path):
+            message = "the file says that its images show all around (equirectangular, or the like)"
+            if request.calibration is None:
+                remedy = "make a flat view of it: ffmpeg -i VIDEO -vf v360=e:flat:h_fov=90:v_fov=60 OUT.mp4"
+                raise DvoError(message, file=path, remedy=remedy)
+            self.warnings.append(f"{message}: they are read as those of the calibration")
         shown = shown_seconds(path)
         if shown is not None and self.frame_count is not None and RATES[0] <= rate <= RATES[1]:
             # the frames before and behind what is shown are counted, and not decoded
@@ -257,7 +283,9 @@ class VideoRecording:
         if has_telemetry(path):
             self.warnings += gopro_notes(path)
             self.positions = partial(read_gopro_positions, path)
-            if request.times is None and request.fps is None and self._use_container:
+            if mirrors(self.orientation):
+                self.warnings.append("inertial samples of the telemetry are not used: frames are mirrored")
+            elif request.times is None and request.fps is None and self._use_container:
                 self.inertial = partial(read_gopro, path, self.turned)
             else:
                 self.warnings.append("inertial samples of the telemetry are not used: frames have no times of the file")
@@ -285,7 +313,7 @@ class VideoRecording:
                 if decoded and image is not None:
                     repeats = repeats or (previous is not None and np.array_equal(previous, image))
                     previous = image
-                    yield image.swapaxes(0, 1) if self.turned in (90, 270) else image
+                    yield image
 
         looked_at = images()
         interlaced = are_interlaced(looked_at)
@@ -335,6 +363,7 @@ class VideoRecording:
                     log.unreadable.append(f"frame {index}")
                     continue
                 previous = timestamp
+                image = oriented(image, self.orientation)
                 if self._square is not None:
                     image = cv2.resize(image, self._square, interpolation=cv2.INTER_LINEAR)
                 image = image if selection.reduction is None else selection.reduction(image)

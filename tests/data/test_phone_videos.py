@@ -197,6 +197,61 @@ def test_videos_that_show_all_around_are_said(tmp_path, version):
     assert len(list(source)) == COUNT and "show all around" in " ".join(source.warnings)
 
 
+@pytest.mark.parametrize("container", ["mp4", "mkv"])
+def test_two_videos_in_a_file_are_said(tmp_path, container):
+    """Front and rear cameras, or colour and depth, in one file."""
+    front = encode(tmp_path / "front.mp4", *FORMS["h264.mp4"])
+    rear = encode(tmp_path / "rear.mp4", *FORMS["h264.mp4"], pictures=[image[:, ::-1] for image in PICTURES])
+    both = tmp_path / f"both.{container}"
+    ffmpeg("-i", front, "-i", rear, "-map", "0:v", "-map", "1:v", "-c", "copy", both)
+    source = open_source(both, calib=CALIB)
+    assert max(differences(list(source))) < 3
+    assert (
+        f"holds 2 videos, of which the first is read: another one is ffmpeg -i both.{container}" in source.warnings[0]
+    )
+    assert open_source(front, calib=CALIB).warnings == []
+
+
+def test_whole_files_are_not_said_to_be_cut(tmp_path):
+    """Matroska and FLV state a duration, which is that of longer sound, or begins before the first image."""
+    silent = encode(tmp_path / "silent.mp4", *FORMS["h264.mp4"])
+    sound = ("-f", "lavfi", "-i", "sine=frequency=440:duration=2")
+    ffmpeg("-i", silent, *sound, "-c:v", "copy", "-c:a", "pcm_s16le", tmp_path / "sound.mkv")
+    ffmpeg("-i", silent, "-c", "copy", tmp_path / "silent.flv")
+    for name in ("sound.mkv", "silent.flv"):
+        source = open_source(tmp_path / name, calib=CALIB)
+        assert len(list(source)) == COUNT and "cut short" not in " ".join(source.warnings)
+    data = (tmp_path / "sound.mkv").read_bytes()
+    (tmp_path / "cut.mkv").write_bytes(data[: len(data) // 6])
+    source = open_source(tmp_path / "cut.mkv", calib=CALIB)
+    assert len(list(source)) < COUNT and "cut short" in " ".join(source.warnings)
+
+
+def test_the_pattern_of_the_colours_of_a_gif_is_not_interlaced(tmp_path):
+    texture = np.random.default_rng(1).integers(0, 256, (HEIGHT // 8, WIDTH // 8, 3), dtype=np.uint8)
+    moving = [np.roll(texture.repeat(8, 0).repeat(8, 1), 3 * index, 1) for index in range(COUNT)]
+    rows = [np.where(np.arange(HEIGHT)[:, None, None] % 2, image, 255 - image).astype(np.uint8) for image in moving]
+    assert open_source(encode(tmp_path / "a.gif", pictures=rows), calib=CALIB).warnings == []
+    assert (
+        "interlaced" in open_source(encode(tmp_path / "a.mkv", "-c:v", "ffv1", pictures=rows), calib=CALIB).warnings[0]
+    )
+
+
+@pytest.mark.parametrize("name", ["12:30:05.mp4", "file:clip.mp4", "-c.mp4", "100%.mp4", "a%03d.mp4", "a|b\nc.mp4"])
+def test_names_that_mean_something_to_ffmpeg(tmp_path, monkeypatch, name):
+    encode(tmp_path / "v.mp4", *FORMS["h264.mp4"]).rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert len(list(open_source(name, calib=CALIB))) == COUNT
+
+
+def test_a_codec_that_is_not_decoded_is_named(tmp_path):
+    file = encode(tmp_path / "v.mp4", *FORMS["h264.mp4"])
+    data = file.read_bytes()
+    file.write_bytes(data.replace(b"avc1", b"qqqq").replace(b"avcC", b"qqqC"))
+    with pytest.raises(DvoError, match=r"decode.*qqqq.*-c:v libx264|does not decode"):
+        open_source(file, calib=CALIB)
+
+
 def test_trimmed_videos_are_whole_and_cut_ones_are_not(tmp_path):
     pictures = [picture(index % 20) for index in range(60)]
     options = ("-c:v", "libx264", "-g", 60, "-pix_fmt", "yuv420p", "-movflags", "faststart")

@@ -67,6 +67,43 @@ def orientation(file: Path) -> int | None:
         return None
 
 
+def count_videos(file: Path) -> int:
+    """Number of tracks of images, 1 of another container.
+
+    Args:
+        file: a video.
+    """
+    try:
+        with file.open("rb") as stream:
+            is_matroska = stream.read(4) == _MATROSKA
+        if is_matroska:
+            return max(1, len(_matroska_tracks(file)))
+        return max(1, sum(kind == b"trak" and _is_video(track) for kind, track in boxes(_index(file) or b"")))
+    except _DAMAGED:
+        return 1
+
+
+def is_whole(file: Path) -> bool:
+    """True for a Matroska file that ends where it says: its number of frames may be that of longer sound.
+
+    Args:
+        file: a video.
+    """
+    try:
+        with file.open("rb") as stream:
+            data, size = stream.read(_HEAD), file.stat().st_size
+        at = 0
+        while data.startswith(_MATROSKA) and at < len(data):
+            kind, after = _number(data, at, marker=True)
+            length, start = _number(data, after)
+            if kind == _SEGMENT:
+                return start + length <= size
+            at = start + length
+    except _DAMAGED:
+        return False
+    return False
+
+
 def is_sphere(file: Path) -> bool:
     """True for a video whose images show all around (equirectangular, cubes), by its head.
 
@@ -156,13 +193,17 @@ def _of_projection(file: Path) -> int | None:
 
 def _projection(file: Path) -> dict[int, bytes]:
     """Elements of the projection of the first track of images of a Matroska file; none if its head has no tracks."""
+    video = next(iter(_matroska_tracks(file)), {}).get(_VIDEO, b"")
+    return dict(_elements(dict(_elements(video)).get(_PROJECTION, b"")))
+
+
+def _matroska_tracks(file: Path) -> list[dict[int, bytes]]:
+    """Elements of each track of images."""
     with file.open("rb") as stream:
         head = dict(_elements(stream.read(_HEAD)))
-    for kind, track in _elements(dict(_elements(head.get(_SEGMENT, b""))).get(_TRACKS, b"")):
-        parts = dict(_elements(track)) if kind == _TRACK else {}
-        if parts.get(_TRACK_TYPE) == b"\x01":
-            return dict(_elements(dict(_elements(parts.get(_VIDEO, b""))).get(_PROJECTION, b"")))
-    return {}
+    entries = _elements(dict(_elements(head.get(_SEGMENT, b""))).get(_TRACKS, b""))
+    tracks = [dict(_elements(track)) for kind, track in entries if kind == _TRACK]
+    return [track for track in tracks if track.get(_TRACK_TYPE) == b"\x01"]
 
 
 def _elements(data: bytes) -> Iterator[tuple[int, bytes]]:

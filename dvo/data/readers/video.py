@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.core.text import visible
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.files.files import is_file, lookups
 from dvo.data.files.output import spelled_in_text
@@ -31,7 +32,7 @@ from dvo.data.inertial_files.gopro import gopro_notes, read_gopro, read_gopro_po
 from dvo.data.inertial_files.gpmf import has_telemetry
 from dvo.data.positions import Positions
 from dvo.data.readers.avi_index import is_misindexed
-from dvo.data.readers.container import is_sphere, orientation, shown_seconds
+from dvo.data.readers.container import count_videos, is_sphere, is_whole, orientation, shown_seconds
 from dvo.data.recording import EVERYTHING, Log, RawFrame, Reader, Recording, Request, Selection
 from dvo.data.trajectory import Trajectory
 
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 # Half a minute of 30 Hz video without a frame is taken for the end.
 _GIVE_UP_AFTER = 900
 _JUMP = 5000.0  # milliseconds: frames in another order than that of their times lie far less apart
+_HELD_BACK = 4  # frames that a codec needs before it gives the first one
 _BINARY = re.compile(rb"[^\t\n\r\x0c\x20-\x7e\x80-\xff]")
 _NAMES_FILES = re.compile(rb"(\xef\xbb\xbf)?\s*(ffconcat|#EXTM3U|<\?xml|v=0)", re.IGNORECASE)
 _SECONDS = 4  # to open, and to find the next frame: gigabytes without one are no video
@@ -135,10 +137,10 @@ def _no_video(path: Path, head: bytes) -> str | None:
     return None
 
 
-def _is_row_of_jpegs(path: Path) -> bool:
-    """True for JPEG images one after the other, without a container: FFmpeg gives them the times of 25 a second."""
+def _head(path: Path) -> bytes:
+    """The first bytes, which tell the container."""
     with lookups(path), path.open("rb") as file:
-        return file.read(2) == b"\xff\xd8"
+        return file.read(12)
 
 
 def _does_not_convert(path: Path) -> bool:
@@ -161,6 +163,12 @@ def _does_not_convert(path: Path) -> bool:
         except (OSError, subprocess.TimeoutExpired):
             return False
     return b"interlaced" in said
+
+
+def _codec(code: float) -> str:
+    """Name of a codec in brackets, of its four letters; nothing for another number."""
+    name = int(code).to_bytes(4, "little") if 0 < code < 2**32 else b""
+    return f" (codec {name.decode()})" if name.isalnum() else ""
 
 
 def _grabs(capture: cv2.VideoCapture) -> Iterator[tuple[int, float, int]]:
@@ -253,10 +261,13 @@ class VideoRecording:
             size = [capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
             width, height = reversed(size) if self.orientation > 4 else size
             self._square = _square_size(width, height, _aspect(capture), self.turned, request.calibration)
+            code = capture.get(cv2.CAP_PROP_FOURCC)
             first, interlaced = self._look(capture)
+        head = _head(path)
         if not first:
-            raise DvoError("no frame of this video decodes", file=path, remedy="check that it plays, or re-encode it")
-        if interlaced:
+            remedy = "check that it plays, or re-encode it: ffmpeg -i VIDEO -c:v libx264 OUT.mp4"
+            raise DvoError(f"no frame of this video decodes{_codec(code)}", file=path, remedy=remedy)
+        if interlaced and not head.startswith(b"GIF"):  # whose few colours may be a pattern of lines
             self.warnings.append(INTERLACED)
         # containers without a count give huge or negative numbers
         self.frame_count: int | None = int(announced) if 0 < announced < 1e9 else None
@@ -266,6 +277,11 @@ class VideoRecording:
                 f"the pixels of the video are not square: images of {width:g}x{height:g} are resized to {wide}x{high}"
             )
         self.warnings += [MIRRORED] * mirrors(self.orientation)
+        if (count := count_videos(path)) > 1:
+            self.warnings.append(
+                f"the file holds {count} videos, of which the first is read: another one is "
+                f"ffmpeg -i {visible(path.name)} -map 0:v:1 -c copy OUT{visible(path.suffix)}"
+            )
         if is_misindexed(path):
             self.warnings.append("the index of the file is damaged: frames are read in the order in which they lie")
         if is_sphere(path):
@@ -291,7 +307,10 @@ class VideoRecording:
                 self.warnings.append("inertial samples of the telemetry are not used: frames have no times of the file")
         self._fps = fps or (rate if np.isfinite(rate) and RATES[0] <= rate <= RATES[1] else NOMINAL_FPS)
         self.rate = self._fps if self._times is None else None
-        is_stated = self._use_container and not _is_row_of_jpegs(path)
+        is_stated = self._use_container and not head.startswith(
+            b"\xff\xd8"
+        )  # of JPEGs in a row FFmpeg gives 25 a second
+        self._is_counted = head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free") or head.startswith(b"RIFF")
         if self._times is None and not is_stated and request.fps is None:
             known = "the stated" if self._fps == rate else "a guessed"
             self.warnings.append(
@@ -371,9 +390,10 @@ class VideoRecording:
         missing = (self.frame_count or 0) - read - len(log.unreadable)
         if self._use_container and missing > 0:  # of a variable rate the announced number may be rate times duration
             missing = min(missing, round((self.frame_count or 0) - 1 - last / 1000 * self._fps))
-        if missing > 0 and selection.interval.end is None:
-            # healthy files may be off by a frame or so: estimated counts, edit lists
-            verdict = ": it is cut short or damaged" if missing > max(1, (self.frame_count or 0) // 200) else ""
+        if missing > 0 and selection.interval.end is None and (log.unreadable or not is_whole(self.path)):
+            # healthy files may be off by a frame or so: edit lists, counts by a duration that begins before the images
+            spare = max(1 if self._is_counted else _HELD_BACK, (self.frame_count or 0) // 200)
+            verdict = ": it is cut short or damaged" if missing > spare else ""
             log.notes.append(f"the video announces {self.frame_count} frames, {read} could be read{verdict}")
 
     def _time(self, index: int, milliseconds: float) -> float | None:

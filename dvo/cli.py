@@ -234,6 +234,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         Exit code, see :mod:`dvo.commands`.
     """
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # images that do not decode are counted, and told once
     with _terminable() as received:
         code = _run(argv, received)
     code = _flush(code)

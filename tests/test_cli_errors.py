@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -31,6 +33,18 @@ def calibration(folder: Path, text: str = "50 50 31.5 23.5") -> str:
     file = folder / "some_calibration.txt"
     file.write_text(text + "\n")
     return str(file)
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".pgm", ".bmp"])
+def test_damaged_images_are_one_line(tmp_path, suffix):
+    """In a process of its own: OpenCV prints lines of its own, and asks for its level of logging once."""
+    code = cv2.imencode(suffix, np.random.default_rng(0).integers(0, 256, (48, 64, 1), np.uint8))[1].tobytes()
+    (tmp_path / "images").mkdir()
+    for index in range(3):
+        (tmp_path / "images" / f"{index}{suffix}").write_bytes(code[: len(code) - 20])
+    command = [sys.executable, "-m", "dvo", "run", str(tmp_path / "images"), "--calib", calibration(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "none of the 3 images decodes" in done.stderr
 
 
 def test_missing_source(tmp_path, capsys):

@@ -10,7 +10,7 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.data.files.files import read_image_file
-from dvo.data.images.image_header import MAX_PIXELS, image_size
+from dvo.data.images.image_header import MAX_PIXELS, image_size, white_value
 from dvo.data.images.orientation import oriented
 from dvo.data.images.reduction import Reduction
 
@@ -158,7 +158,7 @@ def read_image(
 
 
 def converted(image: np.ndarray, path: Path, bits: int = 16) -> np.ndarray:
-    """Convert the decoded image of a file, see :func:`to_rgb8`.
+    """Convert the decoded image of a file, see :func:`to_rgb8`; of a PGM or PPM by the value of white that it states.
 
     Args:
         image: as OpenCV decodes it.
@@ -171,6 +171,9 @@ def converted(image: np.ndarray, path: Path, bits: int = 16) -> np.ndarray:
     Raises:
         DvoError: pixels that are no colours (float).
     """
+    white = white_value(path)
+    if white is not None:
+        image = np.minimum(image.astype(np.float32) * (255 / white) + 0.5, 255).astype(np.uint8)
     try:
         return to_rgb8(image, bits)
     except DvoError as error:
@@ -226,6 +229,8 @@ def decode_bytes(
     upright = size[::-1] if orientation > 4 else size
     if reduction is not None and reduction.is_exact and reduction.recorded == upright and data.startswith(b"\xff\xd8"):
         mode = _reduced_modes().get(reduction.factor, mode)  # the decoder of JPEG files does less work then
+    if data[:2] in (b"P1", b"P2", b"P3"):  # the last number ends with the file
+        data += b"\n"
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode)
     except cv2.error:

@@ -1,4 +1,4 @@
-"""Images turned and mirrored as the EXIF data of JPEG files ask for, such as those of a phone that was held upright."""
+"""Images turned and mirrored as their EXIF data ask for, such as those of a phone that was held upright."""
 
 from __future__ import annotations
 

@@ -283,9 +283,8 @@ def _intrinsics(entries: Entries, path: Path) -> tuple[Calibration, list[float]]
     found = [entries.numbers(*names, shape="scalar") for names in (fields.FX, fields.FY, fields.CX, fields.CY)]
     focal = entries.numbers(*fields.FOCAL) if found[0] is None and found[1] is None else None
     if focal is not None and focal.size in (1, 2):
-        found[0], found[1] = focal.ravel()[0], focal.ravel()[-1]
-        if focal.size == 1:
-            found[1] = found[1] * _pixel_aspect(entries, path)
+        aspect = _pixel_aspect(entries, path) if focal.size == 1 else 1.0
+        found[0], found[1] = focal.ravel()[0], focal.ravel()[-1] * aspect
     centre = entries.numbers(*fields.CENTRE) if found[2] is None and found[3] is None else None
     if centre is not None and centre.size == 2:
         found[2], found[3] = centre.ravel()

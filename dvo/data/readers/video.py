@@ -255,7 +255,7 @@ class VideoRecording:
         self.warnings: list[str] = []
         with _capture(path) as capture:
             announced, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
-            angle = capture.get(cv2.CAP_PROP_ORIENTATION_META) % 360
+            angle = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360
             self.orientation = orientation(path) or {90: 6, 180: 3, 270: 8}.get(angle, 1)
             self.turned = turn(self.orientation)
             size = [capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]

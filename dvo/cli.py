@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import logging
 import os
 import signal
 import sys
@@ -234,6 +235,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         Exit code, see :mod:`dvo.commands`.
     """
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "OFF")  # images that do not decode are counted, and told once
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it speaks of a home that cannot be written
     with _terminable() as received:
         code = _run(argv, received)
     code = _flush(code)
@@ -244,6 +247,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None, received: Sequence[KeyboardInterrupt]) -> int:
     try:
+        if not _has_folder():
+            message, remedy = "the working directory is gone", "change to one that exists (cd)"
+            return _complain(DvoError(message, remedy=remedy), BAD_INPUT)
         arguments = build_parser().parse_args(argv)
         is_tracking = arguments.command in _TRACKING
         check_limits(TRACKING if is_tracking else LOADING)
@@ -257,6 +263,14 @@ def _run(argv: Sequence[str] | None, received: Sequence[KeyboardInterrupt]) -> i
     except (Exception, KeyboardInterrupt) as error:
         # A library may turn the exception of a signal into one of its own.
         return _failed(received[-1] if received else error)
+
+
+def _has_folder() -> bool:
+    """False in a deleted working directory, where libraries end the process with lines of their own."""
+    try:
+        return bool(os.getcwd())
+    except OSError:
+        return False
 
 
 def _failed(error: Exception | KeyboardInterrupt) -> int:

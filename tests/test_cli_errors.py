@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -31,6 +34,48 @@ def calibration(folder: Path, text: str = "50 50 31.5 23.5") -> str:
     file = folder / "some_calibration.txt"
     file.write_text(text + "\n")
     return str(file)
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".pgm", ".bmp"])
+def test_damaged_images_are_one_line(tmp_path, suffix):
+    """In a process of its own: OpenCV prints lines of its own, and asks for its level of logging once."""
+    code = cv2.imencode(suffix, np.random.default_rng(0).integers(0, 256, (48, 64, 1), np.uint8))[1].tobytes()
+    (tmp_path / "images").mkdir()
+    for index in range(3):
+        (tmp_path / "images" / f"{index}{suffix}").write_bytes(code[: len(code) - 20])
+    command = [sys.executable, "-m", "dvo", "run", str(tmp_path / "images"), "--calib", calibration(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "none of the 3 images decodes" in done.stderr
+
+
+def in_a_process(*command: str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    found = {**os.environ, "PYTHONPATH": str(Path(dvo.__file__).parents[1]), **variables}
+    return subprocess.run([sys.executable, *command], capture_output=True, text=True, cwd=folder, env=found)
+
+
+def test_a_name_that_begins_with_a_dash(tmp_path):
+    (tmp_path / "-x.mp4").write_bytes(b"")
+    done = in_a_process("-m", "dvo", "run", "-x.mp4", folder=tmp_path)
+    assert done.returncode == 2 and "the file -x.mp4 is ./-x.mp4" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_working_directory_that_is_gone(tmp_path):
+    """Libraries end the process there with lines of their own."""
+    (tmp_path / "gone").mkdir()
+    leave = "import os, sys; os.rmdir(os.getcwd()); import dvo.cli; sys.exit(dvo.cli.main(['run', 'v.mp4']))"
+    done = in_a_process("-c", leave, folder=tmp_path / "gone")
+    assert done.returncode == 2 and "the working directory is gone" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_home_that_cannot_be_written_is_no_matter(image_folder, tmp_path):
+    (tmp_path / "home").write_bytes(b"")
+    plot = (
+        "import dvo.cli, numpy as np; from pathlib import Path; dvo.cli.main(['--version']); "
+        "from dvo.viz.plot import *; from dvo.data.trajectory import Trajectory; "
+        "plot_trajectory(Path('a.png'), Trajectory(np.arange(3.0), np.eye(7)[[0, 1, 6]] + np.eye(7)[6]))"
+    )
+    done = in_a_process("-c", plot, folder=tmp_path, HOME=str(tmp_path / "home"))
+    assert done.returncode == 0 and done.stderr == "" and (tmp_path / "a.png").exists()
 
 
 def test_missing_source(tmp_path, capsys):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from pathlib import Path
 from typing import NoReturn
 
 from dvo.core.text import printable
@@ -15,6 +17,9 @@ class OneLineParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the message and exit."""
+        names = [word for word in sys.argv[1:] if word.startswith("-") and Path(word).is_file()]
+        if names:
+            message += f"; the file {names[0]} is ./{names[0]}, or it would be an option"
         self.exit(BAD_ARGUMENT, printable(f"{self.prog}: error: {message} (see {self.prog} --help)") + "\n")
 
 

@@ -111,7 +111,8 @@ def open_masks(
         reduction: of the images; None for none.
 
     Raises:
-        DvoError: nothing there, another number of masks than of images, or a first mask that cannot be used.
+        DvoError: nothing there, another number of masks than of images, a first mask that cannot be used, or a single
+            one that leaves no pixel.
     """
     if not path.is_dir():
         files = [path]
@@ -129,5 +130,8 @@ def open_masks(
             message = f"{len(found)} masks for {images_text} images, and not of the same names"
             raise DvoError(message, file=path, field="mask", remedy="give one mask, or one for every image")
     masks = Masks(files, size, invert, reduction)
-    masks(0, None)
+    first = masks(0, None)
+    if len(files) == 1 and not first.any():
+        remedy = "white is used and black ignored, with --mask-invert the other way round"
+        raise DvoError("hides all of the image", file=files[0], field="mask", remedy=remedy)
     return masks

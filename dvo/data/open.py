@@ -17,7 +17,7 @@ from dvo.data.calibration.read import read_calibration
 from dvo.data.companions.inertial_source import AUTO, NONE, choose_inertial, imu_calibration_of
 from dvo.data.files.files import lookups
 from dvo.data.files.stamps import checked_rate
-from dvo.data.images.fields import INTERLACED, are_interlaced
+from dvo.data.images.fields import INTERLACED, MOSAIC, are_interlaced, is_mosaic
 from dvo.data.images.halves import two_views
 from dvo.data.images.image_header import holds_several
 from dvo.data.images.reduction import MAX_PIXELS, reduction_to
@@ -173,7 +173,9 @@ def open_source(
         doubts.append(
             f"{visible(recording.images[0].name)} holds several images, of which the first is read: take them apart"
         )
-    if recording.kind in ("folder", "rosbag") and are_interlaced(raw.image for raw in recording.frames(Log())):
+    if is_mosaic(first.image):
+        doubts.append(MOSAIC)
+    elif recording.kind in ("folder", "rosbag") and are_interlaced(raw.image for raw in recording.frames(Log())):
         doubts.append(INTERLACED)
     reduction = reduction_to(max_pixels, width, height)
     size, masks = (width, height), None

@@ -15,6 +15,7 @@ from dvo.core.errors import DvoError
 from dvo.core.text import visible
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.files.files import exists
+from dvo.data.images.image_header import white_value
 from dvo.data.images.images import converted, decode, few_bits, read_image, used_bits
 from dvo.data.images.orientation import check_zoom, common_orientation, turn
 from dvo.data.images.reduction import Reduction
@@ -321,7 +322,7 @@ class ImageRecording:
         some = sorted({round(k * (len(self.images) - 1) / (_LOOKED_AT - 1)) for k in range(_LOOKED_AT)})
         decoded = (decode(self.images[index]) for index in some)
         first = next((image for image in decoded if image is not None), None)
-        if first is None or first.dtype != np.uint16:
+        if first is None or first.dtype != np.uint16 or white_value(self.images[0]) is not None:
             return 16
         bits = used_bits(decode(self.images[index]) for index in some)
         if bits < 16:

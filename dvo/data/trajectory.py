@@ -118,8 +118,8 @@ def read_tum(path: Path | str) -> Trajectory:
         Camera-to-world poses in the order of the rows, quaternions normalised; of rows with the same time the first.
 
     Raises:
-        DvoError: missing file, no rows, a row without 8 finite numbers, a quaternion of another length than one, or
-            times that decrease.
+        DvoError: missing file, no rows, a row without 8 finite numbers, a quaternion of another length than one, times
+            that decrease, or that have lost their digits.
 
     Example:
         >>> from pathlib import Path
@@ -139,6 +139,11 @@ def read_tum(path: Path | str) -> Trajectory:
             field=f"line {numbers[row]}",
             remedy="sort the rows",
         )
+    moved = (np.diff(times) == 0) & (np.diff(poses, axis=0) != 0).any(1)
+    if 2 * moved.sum() > len(times):
+        message = f"{moved.sum()} of {len(times)} rows have the time of the row before, and another pose"
+        field = f"line {numbers[int(np.argmax(moved)) + 1]}"
+        raise DvoError(message, file=path, field=field, remedy="write the times with all their digits")
     poses[:, 3:] = unit_quaternions(poses[:, 3:], path, numbers)
     first = np.diff(times, prepend=-np.inf) > 0  # TUM's own ground truth repeats some rows
     return Trajectory(times[first], poses[first])

@@ -85,7 +85,9 @@ def test_a_mask_is_undistorted_with_its_image(make):
 def test_masks_that_cannot_be_used(make):
     folder = make.images("clip", ["0.png"])
     assert cv2.imwrite(str(make.root / "small.png"), np.ones((10, 12), np.uint8))
-    for mask, message in (("small.png", "is 12x10, the images are 64x48"), ("none.png", "no such file")):
+    assert cv2.imwrite(str(make.root / "black.png"), np.zeros((48, 64), np.uint8))
+    wrong = {"small.png": "is 12x10, the images are 64x48", "none.png": "no such file", "black.png": "hides all"}
+    for mask, message in wrong.items():
         with pytest.raises(DvoError, match=message):
             open_source(folder, calib=CALIB, fps=1, mask=make.root / mask)
     with pytest.raises(DvoError, match="cannot be read as an image"):

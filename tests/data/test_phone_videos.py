@@ -150,22 +150,106 @@ def test_sound_is_ignored(tmp_path, order):
     assert all(np.array_equal(a.image, b.image) for a, b in zip(frames, silent, strict=True))
 
 
-@pytest.mark.parametrize("clockwise", [90, 180, 270])
-def test_turned(tmp_path, clockwise):
-    upright = encode(tmp_path / "v.mp4", *FORMS["h264.mp4"])
-    file = tmp_path / "turned.mp4"
-    ffmpeg("-display_rotation", -clockwise, "-i", upright, "-c", "copy", file)  # its angles are counter-clockwise
-    source = open_source(file, calib=CALIB if clockwise == 180 else PORTRAIT)
-    assert source.turned == clockwise
-    frames = list(source)
-    assert max(differences(frames, [np.rot90(image, -clockwise // 90) for image in PICTURES])) < 3
+@pytest.mark.parametrize("container", ["mp4", "mov", "mkv", "webm"])
+@pytest.mark.parametrize("flip", [None, "-display_hflip", "-display_vflip"])
+def test_turned_and_mirrored(tmp_path, container, flip):
+    """Frames are what ffmpeg shows; OpenCV's own turning takes mirrored frames for others."""
+    codec = ("-c:v", "libvpx", "-crf", 4, "-b:v", "4M") if container == "webm" else FORMS["h264.mp4"]
+    plain = encode(tmp_path / f"plain.{container}", *codec)
+    for clockwise in (0, 90, 180, 270):
+        file = tmp_path / f"{clockwise}.{container}"
+        turning = ("-display_rotation", -clockwise, *([flip] if flip else []))  # its angles are counter-clockwise
+        ffmpeg(*turning, "-i", plain, "-c", "copy", file)
+        ffmpeg("-i", file, "-frames:v", 1, tmp_path / "shown.png")
+        shown = cv2.cvtColor(cv2.imread(str(tmp_path / "shown.png")), cv2.COLOR_BGR2RGB)
+        source = open_source(file, calib=PORTRAIT if clockwise in (90, 270) else CALIB)
+        frame = next(iter(source)).image
+        assert frame.shape == shown.shape and np.abs(frame.astype(float) - shown).mean() < 3
+        assert ["mirror" in warning for warning in source.warnings] == [True] * (flip is not None)
+        assert flip or source.turned == clockwise
 
 
-def test_a_mirrored_video_is_told(tmp_path):
-    plain, file = encode(tmp_path / "v.mp4", *FORMS["h264.mp4"]), tmp_path / "mirrored.mp4"
-    assert open_source(plain, calib=CALIB).warnings == []
-    ffmpeg("-display_vflip", "-i", plain, "-c", "copy", file)
-    assert ["mirrored" in warning for warning in open_source(file, calib=CALIB).warnings] == [True]
+def spherical(version):
+    """The box by which a track says that it shows all around: Google's first version, in XML, and the second."""
+
+    def box(kind, content):
+        return (len(content) + 8).to_bytes(4) + kind + content
+
+    if version == 1:
+        return box(b"uuid", bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + b"<rdf:SphericalVideo/>")
+    projection = box(b"proj", box(b"prhd", bytes(16)) + box(b"equi", bytes(20)))
+    return box(b"sv3d", box(b"svhd", bytes(5)) + projection)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_videos_that_show_all_around_are_said(tmp_path, version):
+    file = encode(tmp_path / "v.mp4", *FORMS["h264.mp4"])
+    data, box = bytearray(file.read_bytes()), spherical(version)
+    around = [b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1"][: 2 if version == 1 else 7]
+    places = [data.index(name, data.index(b"moov")) - 4 for name in around]
+    end = places[-1] + int.from_bytes(data[places[-1] : places[-1] + 4])
+    for at in places:  # the index follows the frames, whose places stay
+        data[at : at + 4] = (int.from_bytes(data[at : at + 4]) + len(box)).to_bytes(4)
+    file.write_bytes(data[:end] + box + data[end:])
+    with pytest.raises(DvoError, match="show all around.*v360=e:flat"):
+        open_source(file, guess=True)
+    source = open_source(file, calib=CALIB)
+    assert len(list(source)) == COUNT and "show all around" in " ".join(source.warnings)
+
+
+@pytest.mark.parametrize("container", ["mp4", "mkv"])
+def test_two_videos_in_a_file_are_said(tmp_path, container):
+    """Front and rear cameras, or colour and depth, in one file."""
+    front = encode(tmp_path / "front.mp4", *FORMS["h264.mp4"])
+    rear = encode(tmp_path / "rear.mp4", *FORMS["h264.mp4"], pictures=[image[:, ::-1] for image in PICTURES])
+    both = tmp_path / f"both.{container}"
+    ffmpeg("-i", front, "-i", rear, "-map", "0:v", "-map", "1:v", "-c", "copy", both)
+    source = open_source(both, calib=CALIB)
+    assert max(differences(list(source))) < 3
+    assert (
+        f"holds 2 videos, of which the first is read: another one is ffmpeg -i both.{container}" in source.warnings[0]
+    )
+    assert open_source(front, calib=CALIB).warnings == []
+
+
+def test_whole_files_are_not_said_to_be_cut(tmp_path):
+    """Matroska and FLV state a duration, which is that of longer sound, or begins before the first image."""
+    silent = encode(tmp_path / "silent.mp4", *FORMS["h264.mp4"])
+    sound = ("-f", "lavfi", "-i", "sine=frequency=440:duration=2")
+    ffmpeg("-i", silent, *sound, "-c:v", "copy", "-c:a", "pcm_s16le", tmp_path / "sound.mkv")
+    ffmpeg("-i", silent, "-c", "copy", tmp_path / "silent.flv")
+    for name in ("sound.mkv", "silent.flv"):
+        source = open_source(tmp_path / name, calib=CALIB)
+        assert len(list(source)) == COUNT and "cut short" not in " ".join(source.warnings)
+    data = (tmp_path / "sound.mkv").read_bytes()
+    (tmp_path / "cut.mkv").write_bytes(data[: len(data) // 6])
+    source = open_source(tmp_path / "cut.mkv", calib=CALIB)
+    assert len(list(source)) < COUNT and "cut short" in " ".join(source.warnings)
+
+
+def test_the_pattern_of_the_colours_of_a_gif_is_not_interlaced(tmp_path):
+    texture = np.random.default_rng(1).integers(0, 256, (HEIGHT // 8, WIDTH // 8, 3), dtype=np.uint8)
+    moving = [np.roll(texture.repeat(8, 0).repeat(8, 1), 3 * index, 1) for index in range(COUNT)]
+    rows = [np.where(np.arange(HEIGHT)[:, None, None] % 2, image, 255 - image).astype(np.uint8) for image in moving]
+    assert open_source(encode(tmp_path / "a.gif", pictures=rows), calib=CALIB).warnings == []
+    assert (
+        "interlaced" in open_source(encode(tmp_path / "a.mkv", "-c:v", "ffv1", pictures=rows), calib=CALIB).warnings[0]
+    )
+
+
+@pytest.mark.parametrize("name", ["12:30:05.mp4", "file:clip.mp4", "-c.mp4", "100%.mp4", "a%03d.mp4", "a|b\nc.mp4"])
+def test_names_that_mean_something_to_ffmpeg(tmp_path, monkeypatch, name):
+    encode(tmp_path / "v.mp4", *FORMS["h264.mp4"]).rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert len(list(open_source(name, calib=CALIB))) == COUNT
+
+
+def test_a_codec_that_is_not_decoded_is_named(tmp_path):
+    file = encode(tmp_path / "v.mp4", *FORMS["h264.mp4"])
+    data = file.read_bytes()
+    file.write_bytes(data.replace(b"avc1", b"qqqq").replace(b"avcC", b"qqqC"))
+    with pytest.raises(DvoError, match=r"decode.*qqqq.*-c:v libx264|does not decode"):
+        open_source(file, calib=CALIB)
 
 
 def test_trimmed_videos_are_whole_and_cut_ones_are_not(tmp_path):

@@ -1,9 +1,10 @@
-"""Text of calibration files as plain values: YAML as OpenCV takes it, JSON, OpenCV's XML, ROS's ost."""
+"""Text of calibration files as plain values: YAML as OpenCV takes it, JSON, TOML, OpenCV's XML, ROS's ost."""
 
 from __future__ import annotations
 
 import json
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -72,6 +73,23 @@ def load_json(text: str, path: Path) -> Any:
         return json.loads(text, object_pairs_hook=unique)
     except (ValueError, RecursionError) as error:
         message = f"not valid JSON ({' '.join(str(error).split())[:100]})"
+        raise DvoError(message, file=path, field="calibration", remedy=EXPECTED) from None
+
+
+def load_toml(text: str, path: Path) -> Any:
+    """Parse TOML.
+
+    Args:
+        text: of the file.
+        path: file that it comes from, for messages.
+
+    Raises:
+        DvoError: not valid TOML.
+    """
+    try:
+        return tomllib.loads(text.replace("\r\n", "\n"))
+    except (ValueError, RecursionError) as error:
+        message = f"not valid TOML ({' '.join(str(error).split())[:100]})"
         raise DvoError(message, file=path, field="calibration", remedy=EXPECTED) from None
 
 

@@ -309,11 +309,21 @@ def _entries(tree: Any, path: tuple[Any, ...], holders: list[tuple[Any, ...]], f
         within = {key: value for key, value in mapping.items() if (*place, key) not in holders}
         within = {key: value for key, value in within.items() if (*place, key) not in around}
         entries.found += _own(within, f"{name_of(place)}." if place else "", groups)
-        for key, value in within.items():
-            if isinstance(value, dict | list) and not _is_read(key, value, groups):
-                _look_elsewhere(value, (*place, key), holders, entries)
+        for where, value in _unread(within, place, groups):
+            _look_elsewhere(value, where, holders, entries)
     entries.elsewhere += [name_of(holder) for holder in holders if holder != path]
     return entries
+
+
+def _unread(
+    mapping: dict[str, Any], place: tuple[Any, ...], groups: frozenset[str]
+) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """Mappings and lists of mappings, also those in groups, that are no groups themselves."""
+    for key, value in mapping.items():
+        if isinstance(value, dict | list) and not _is_read(key, value, groups):
+            yield (*place, key), value
+        elif isinstance(value, dict):
+            yield from _unread(value, (*place, key), groups)
 
 
 def _is_read(key: str, value: Any, groups: frozenset[str]) -> bool:

@@ -14,7 +14,7 @@ from dvo.core.errors import DvoError
 from dvo.data.calibration import entries as fields
 from dvo.data.calibration.calibration import EXPECTED, Calibration, Dialect
 from dvo.data.calibration.colmap_cameras import CORNER
-from dvo.data.calibration.documents import is_ost, load_documents, load_json, load_ost, load_xml
+from dvo.data.calibration.documents import is_ost, load_documents, load_json, load_ost, load_toml, load_xml
 from dvo.data.calibration.entries import Entries
 from dvo.data.calibration.lens_names import PINHOLE, bare, is_flag, looks_like_a_lens, model_of, says_nothing
 from dvo.geometry.camera import DistortionModel
@@ -246,6 +246,19 @@ def _refuse_millimetres(calibration: Calibration, entries: Entries, path: Path) 
         )  # fmt: skip
 
 
+def _pixel_aspect(entries: Entries, path: Path) -> float:
+    """``fy`` over ``fx`` of a single focal length, as files of nerfies and Theia state it; 1 by default."""
+    stated = entries.numbers("pixelaspectratio", "pixelaspect", shape="scalar")
+    if stated is not None:
+        return float(stated.ravel()[0])
+    other = entries.numbers("aspectratio", shape="scalar")
+    width, height = _size(entries, path)
+    if other is not None and abs(other - 1) > _SKEW and not (width and height and abs(other - width / height) < 0.01):
+        message = f"{float(other):g} beside one focal length: that of the pixels, or that of the images"
+        raise DvoError(message, file=path, field="aspect_ratio", remedy="give fx and fy")
+    return 1.0
+
+
 def _notes(entries: Entries) -> tuple[str, ...]:
     """Stereo files of ORB-SLAM2 and OpenVSLAM state the cameras as recorded too, and the rectified one as Camera."""
     left = [name for name in entries.elsewhere if name in ("LEFT", "StereoRectifier.left")]
@@ -270,7 +283,8 @@ def _intrinsics(entries: Entries, path: Path) -> tuple[Calibration, list[float]]
     found = [entries.numbers(*names, shape="scalar") for names in (fields.FX, fields.FY, fields.CX, fields.CY)]
     focal = entries.numbers(*fields.FOCAL) if found[0] is None and found[1] is None else None
     if focal is not None and focal.size in (1, 2):
-        found[0], found[1] = focal.ravel()[0], focal.ravel()[-1]
+        aspect = _pixel_aspect(entries, path) if focal.size == 1 else 1.0
+        found[0], found[1] = focal.ravel()[0], focal.ravel()[-1] * aspect
     centre = entries.numbers(*fields.CENTRE) if found[2] is None and found[3] is None else None
     if centre is not None and centre.size == 2:
         found[2], found[3] = centre.ravel()
@@ -561,6 +575,10 @@ DIALECT = Dialect(is_yaml, lambda path, text, camera: from_values(load_documents
 JSON = Dialect(
     lambda path, text: path.suffix.lower() == ".json" or _BRACE.match(text) is not None,
     lambda path, text, camera: from_values(load_json(text, path), path, camera),
+)
+TOML = Dialect(
+    lambda path, text: path.suffix.lower() == ".toml",
+    lambda path, text, camera: from_values(load_toml(text, path), path, camera),
 )
 XML = Dialect(
     lambda path, text: path.suffix.lower() == ".xml" or text.lstrip().startswith("<?xml"),

@@ -30,6 +30,8 @@ _EVEN = 0.25  # share of the usual interval that a camera keeps
 _SLOWEST = 2.0  # seconds: an interval above it is one of a finer unit
 _COUNTER = 10.0  # largest interval of numbers that count images
 _DIGITS = 19  # of an integer of 64 bits
+_TICKS = 10**7  # a second, of Windows and .NET
+_TICK_EPOCHS = (11_644_473_600, 62_135_596_800)  # seconds from the years 1601 and 1 to 1970
 
 _DATE = re.compile(
     r"(?<![0-9])((?:19|20)[0-9]{2})([-_.:/]?)(0[1-9]|1[0-2])\2(0[1-9]|[12][0-9]|3[01])[T _.-]{0,3}"
@@ -119,6 +121,8 @@ def read_table(path: Path, remedy: str, field: str | None = None) -> Table:
             lines.append(number)
         elif not rows and is_comment and line.strip():
             header = header_cells(line)
+    if header and rows and header[0] == "" and len(header) > len(rows[0]):
+        header = header[1:]
     if not rows or (header is not None and is_comment and len(header) != len(rows[0])):
         header = None
     return Table(rows, lines, header, is_comment)
@@ -130,7 +134,7 @@ def _is_header(fields: Sequence[str]) -> bool:
 
 
 def parse_time(text: str) -> int | float:
-    """Parse a number of any unit of time, integers exactly.
+    """Parse a number of any unit of time, integers exactly; ticks of Windows and .NET become nanoseconds since 1970.
 
     Args:
         text: decimal number.
@@ -140,6 +144,9 @@ def parse_time(text: str) -> int | float:
     """
     if len(text) <= _DIGITS + 1 and text.removeprefix("-").isascii() and text.removeprefix("-").isdigit():
         whole = int(text)
+        for epoch in _TICK_EPOCHS:  # as nanoseconds they would be dates of 1974 and 1990
+            if _is_epoch(whole / _TICKS - epoch, 1):
+                return 100 * (whole - epoch * _TICKS)
         if abs(whole) < 2**63:
             return whole
         raise ValueError("out of bounds")
@@ -309,7 +316,8 @@ def header_cells(line: str) -> list[str]:
     """
     text = re.sub(r"\s+(?=[\[(])", "", line.strip().lstrip("#%").split("#", 1)[0].strip())
     cells = re.split(r"[,;\t]", text) if re.search(r"[,;\t]", text) else text.split()
-    return [name for cell in cells if (name := cell.strip().strip('"').strip())]
+    names = [cell.strip().strip('"').strip() for cell in cells]
+    return names[:1] + [name for name in names[1:] if name]  # the first, of the numbers of rows, may be empty
 
 
 def unit_of_name(name: str) -> str | None:

@@ -85,12 +85,13 @@ def spelled_in_text(path: Path) -> Iterator[str]:
         path: to read or to write.
 
     Yields:
-        The path itself, or a link to it that goes away at the end.
+        The whole path (of a relative one FFmpeg takes what stands before a colon for a protocol), or a link to it that
+        goes away at the end.
 
     Raises:
         DvoError: the link cannot be made.
     """
-    text = str(path)
+    text = os.path.abspath(path)
     if in_utf8(text) == text:
         yield text
         return

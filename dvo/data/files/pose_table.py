@@ -42,11 +42,13 @@ class _Columns:
 _TUM = _Columns(0, None, tuple(range(1, _NUMBERS)))
 _EUROC = _Columns(0, "ns", (1, 2, 3, 5, 6, 7, 4))  # state_groundtruth_estimate0/data.csv: velocity and biases follow
 _EUROC_NUMBERS = 17
+_NANOSECONDS = 10**15  # since 1970, at least
 _JOINED = re.compile(  # before an axis: "posx"
     r"(?:pos|position|trans|translation|loc|location|tvec|coord|point|center|centre|gt|est|world|cam|camera|quat|"
     r"quaternion|rot|rotation|orient|orientation)$"
 )
 _OF_CAMERA = re.compile(r"(?:^|[^a-z])[tqrp]?_?(?:cw|c_w|w2c)(?:[^a-z]|$)")  # T_cw
+_IN_WORLD = re.compile(r"([tpq]_?[wxyz])_(?:world|odom|map)_[a-z]+")  # of Project Aria
 _RIGID = 0.02  # largest deviation of a rotation from an orthogonal matrix
 _MATRIX = {13: 12, 17: 16}  # numbers of a row of a time and a matrix, and of the matrix
 
@@ -56,8 +58,8 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
 
     A header that names the columns is followed: in any order, with ``q_w`` before or behind ``q_x``, and further
     columns besides. Without one a row is ``timestamp tx ty tz qx qy qz qw``, one of 17 numbers of EuRoC, or a time and
-    a 3x4 or 4x4 matrix, row by row. Rows whose position or quaternion is NaN throughout, or whose matrix is not finite,
-    are left out: there is no pose at that time.
+    a 3x4 or 4x4 matrix, row by row (or column by column, if it is rigid only so). Rows whose position or quaternion is
+    NaN throughout, or whose matrix is not finite, are left out: there is no pose at that time.
 
     Args:
         path: text or CSV file.
@@ -66,7 +68,8 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
         Times, ``(N, 7)`` float64 ``tx ty tz qx qy qz qw`` (not normalised), and the lines of the rows.
 
     Raises:
-        DvoError: missing or malformed file, no rows, a header without what makes a pose, or a row of other numbers.
+        DvoError: missing or malformed file, no rows, a header without what makes a pose, a row of other numbers, or 17
+            numbers whose time is no nanoseconds.
     """
     table = read_table(path, f"give a file of rows '{HEADER}'")
     if not table.rows:
@@ -83,9 +86,12 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
     if named != width:  # an empty field would shift the others
         message = f"the header names {named} columns, this row has {width}"
         raise DvoError(message, file=path, field=f"line {table.lines[0]}", remedy="give each column a name and a value")
-    if columns is None and _are_matrices(table.rows):
-        table = replace(table, rows=[_of_matrix(fields) for fields in table.rows])
+    if columns is None and (by_columns := _are_matrices(table.rows)) is not None:
+        table = replace(table, rows=[_of_matrix(fields, by_columns) for fields in table.rows])
         width = _NUMBERS
+    elif columns is None and width == _EUROC_NUMBERS and _time_of(table.rows[0]) < _NANOSECONDS:
+        message = "17 numbers without a header, as EuRoC's, but with a time that is no nanoseconds"
+        raise DvoError(message, file=path, field=f"line {table.lines[0]}", remedy="name the columns in the first line")
     if columns is None and width == _NUMBERS and _ends_in_comma(path, table.lines[0]):
         message = "8 numbers without a header, and a comma behind them, as VINS writes poses with q_w before q_x"
         remedy = "write timestamp,tx,ty,tz,qw,qx,qy,qz as the first line, or the order that they have"
@@ -140,27 +146,42 @@ def _ends_in_comma(path: Path, number: int) -> bool:
     return next(line for count, line in lines if count == number).split("#")[0].rstrip().endswith(",")
 
 
-def _are_matrices(rows: Sequence[Sequence[str]]) -> bool:
-    """True for rows of a time and a rigid 3x4 or 4x4 matrix."""
+def _are_matrices(rows: Sequence[Sequence[str]]) -> bool | None:
+    """False for rows of a time and a rigid 3x4 or 4x4 matrix, True if it stands column by column (ARKit), else None."""
     count = _MATRIX.get(len(rows[0]))
     if count is None or any(len(fields) != 1 + count for fields in rows):
-        return False
+        return None
     try:
         matrices = np.array([[float(field) for field in fields[1:]] for fields in rows]).reshape(len(rows), -1, 4)
     except ValueError:
-        return False
+        return None
     matrices = matrices[np.isfinite(matrices).all(axis=(1, 2))]
+    if len(matrices) and _are_rigid(matrices):
+        return False
+    return True if len(matrices) and count == 16 and _are_rigid(np.swapaxes(matrices, 1, 2)) else None
+
+
+def _are_rigid(matrices: np.ndarray) -> bool:
     rotations = matrices[:, :3, :3]
     products = rotations @ np.swapaxes(rotations, 1, 2)
     is_rigid = np.abs(products - np.eye(3)).max(initial=0) < _RIGID and (np.linalg.det(rotations) > 0).all()
-    return bool(len(matrices) and is_rigid and (matrices[:, 3:] == [0, 0, 0, 1]).all())
+    return bool(is_rigid and (matrices[:, 3:] == [0, 0, 0, 1]).all())
 
 
-def _of_matrix(fields: Sequence[str]) -> list[str]:
+def _of_matrix(fields: Sequence[str], by_columns: bool) -> list[str]:
     """The same pose as ``tx ty tz qx qy qz qw``."""
-    matrix = np.array([float(field) for field in fields[1:]]).reshape(-1, 4)[:3]
+    matrix = np.array([float(field) for field in fields[1:]]).reshape(-1, 4)
+    matrix = (matrix.T if by_columns else matrix)[:3]
     pose = poses_from_matrices(matrix) if np.isfinite(matrix).all() else np.full(_NUMBERS - 1, np.nan)
     return [fields[0], *map(repr, pose.tolist())]
+
+
+def _time_of(fields: Sequence[str]) -> float:
+    """The first field of a row, 0 if it is no number."""
+    try:
+        return parse_time(fields[0])
+    except ValueError:
+        return 0.0
 
 
 def _no_row(path: Path, line: int) -> DvoError:
@@ -180,7 +201,8 @@ def _named(header: Sequence[str], path: Path) -> _Columns | None:
             remedy = "give poses of the camera in the world, T_wc"
             raise DvoError("poses of the world in the camera", file=path, field=f"column {cell[:40]!r}", remedy=remedy)
         name = re.sub(r"[\[(].*?[\])]", "", cell.lower()).strip()
-        part = _part(name)
+        in_world = _IN_WORLD.fullmatch(name)
+        part = _part(in_world[1] if in_world else name)
         if part is not None:
             found.setdefault(part, []).append(k)
             unit = re.search(r"[\[(]\s*(mm|cm|m)\s*[\])]", cell.lower())

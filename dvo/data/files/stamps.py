@@ -16,6 +16,8 @@ NOMINAL_FPS = 30.0
 RATES = (1e-5, 1e6)
 """Slowest and fastest images a second: one a day, and more than any camera takes."""
 
+_SHORTEST = 2e-5  # seconds between the images of a list
+
 
 def read_times(path: Path, count: int | None, notes: list[str] | None = None) -> np.ndarray:
     """Read the times of a text or CSV file, one row per image: see :func:`dvo.data.files.clock.clock_of_rows`.
@@ -60,6 +62,9 @@ def read_times(path: Path, count: int | None, notes: list[str] | None = None) ->
             field="times",
             remedy="give one row per image, or another file with --times",
         )
+    if len(times) > 2 and (step := float(np.median(np.diff(times)))) < _SHORTEST:
+        message = f"{1 / step:,.0f} images a second, as of times in days"
+        raise DvoError(message, file=path, field="times", remedy="give seconds, or a header with the unit: 'time [ms]'")
     note = clock.note(str(path))
     if note is not None and notes is not None:
         notes.append(f"{note} (a header such as 'time [s]' says what they are)")

@@ -1,4 +1,4 @@
-"""Focal length and orientation that the EXIF data of a JPEG file state."""
+"""Focal length and orientation that the EXIF data of a JPEG, PNG or WebP file state."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import io
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 _HEAD = 2**18  # bytes in which the EXIF segment begins and ends: it is at most 64 kB, and near the start
+_MOST_CHUNKS = 4096
 _EXIF_IFD, _FOCAL_35MM, _ORIENTATION, _FOCAL = 0x8769, 0xA405, 0x0112, 0x920A
 _INTEGERS = {3: "H", 4: "I", 5: "I"}  # of a fraction the place
 
@@ -19,7 +21,7 @@ def equivalent_focal(file: Path) -> float | None:
         file: an image.
 
     Returns:
-        Millimetres, for a diagonal of 43.27 mm; None if the file does not state it or is no JPEG.
+        Millimetres, for a diagonal of 43.27 mm; None if the file does not state it or is of another format.
     """
     focal = _read(file, _focal)
     return float(focal) if focal else None  # 0 stands for unknown
@@ -32,7 +34,7 @@ def focal_length(file: Path) -> float | None:
         file: an image.
 
     Returns:
-        Millimetres; None if the file does not state it or is no JPEG.
+        Millimetres; None if the file does not state it or is of another format.
     """
 
     def value(tiff: bytes, order: str, first: int) -> int | None:
@@ -59,7 +61,7 @@ def orientation(file: Path) -> int:
         file: an image.
 
     Returns:
-        1 (as stored) to 8; 1 if the file does not state it or is no JPEG.
+        1 (as stored) to 8; 1 if the file does not state it or is of another format.
     """
     found = _read(file, lambda tiff, order, first: _value(tiff, order, first, _ORIENTATION))
     return found if found is not None and 1 <= found <= 8 else 1
@@ -69,13 +71,39 @@ def _read(file: Path, value: Callable[[bytes, str, int], int | None]) -> int | N
     """Value of a TIFF structure, its byte order and the offset of its first directory; None without one."""
     try:
         with file.open("rb") as stream:
-            tiff = _segment(stream.read(_HEAD))
+            tiff = _structure(stream)
         order = {b"II": "<", b"MM": ">"}.get(b"" if tiff is None else tiff[:2])
         if tiff is None or order is None:
             return None
         return value(tiff, order, struct.unpack_from(f"{order}I", tiff, 4)[0])
     except (OSError, ValueError, struct.error):  # cut, or offsets that lead nowhere
         return None
+
+
+def _structure(stream: BinaryIO) -> bytes | None:
+    """TIFF structure of an image file."""
+    head = stream.read(12)
+    if head.startswith(b"\x89PNG\r\n\x1a\n"):
+        return _chunk(stream, 8, ">I4s", b"eXIf")
+    if head[:4] == b"RIFF" and head[8:] == b"WEBP":
+        found = _chunk(stream, 12, "<4sI", b"EXIF")
+        return None if found is None else found.removeprefix(b"Exif\0\0")
+    return _segment(head + stream.read(_HEAD))
+
+
+def _chunk(stream: BinaryIO, at: int, form: str, wanted: bytes) -> bytes | None:
+    """Content of a chunk of a PNG or WebP file; the latter's have even lengths, the former's end in four bytes more."""
+    for _ in range(_MOST_CHUNKS):
+        stream.seek(at)
+        head = stream.read(8)
+        if len(head) < 8:
+            return None
+        one, other = struct.unpack(form, head)
+        kind, length = (one, other) if isinstance(one, bytes) else (other, one)
+        if kind == wanted:
+            return stream.read(min(length, _HEAD))
+        at += 8 + (length + length % 2 if form.startswith("<") else length + 4)
+    return None
 
 
 def _segment(data: bytes) -> bytes | None:

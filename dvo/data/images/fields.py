@@ -1,4 +1,4 @@
-"""Interlaced images: their even and odd lines are of two moments, half a frame apart."""
+"""Images whose lines alternate: interlaced ones, of two moments half a frame apart, and mosaics of colours."""
 
 from __future__ import annotations
 
@@ -15,6 +15,10 @@ INTERLACED_STREAM = (
     "the images are interlaced, their even and odd lines of two moments: set the camera or its converter to "
     "progressive images, or deinterlace them (ffmpeg -i ADDRESS -vf bwdif -f image2pipe - | dvo run -)"
 )
+MOSAIC = (
+    "the images look like the mosaic of a sensor, each pixel of one colour (Bayer): convert them to colour before"
+    " (cv2.cvtColor with a code such as COLOR_BayerRG2BGR, image_proc of ROS)"
+)
 LOOKED_AT = 16  # images
 _TRIPLES = 8  # of images with motion, that suffice
 _FEWEST = 3
@@ -23,8 +27,26 @@ _SHARE = 0.005  # least share of pixels that have moved
 _HIGHEST = 1088  # lines; formats with more know no fields
 _WIDTH = 640  # columns that are looked at, about
 _ROUGH = 1.1  # differences of neighbouring lines over those of every second line; 0.5 for a slope, 1 for noise
+_ALTERNATES = 1.15  # as much, of a mosaic; 1 for noise
 _FURTHER = 1.1  # differences to the farthest field over those within an image, at least
 _NEAR = 0.6  # place of the nearest field beside those of the same image, from 0 (as near) to 1 (as far as any)
+
+
+def is_mosaic(image: np.ndarray) -> bool:
+    """True for the raw image of a colour sensor: neighbours differ more than every second pixel, in rows and columns.
+
+    Args:
+        image: ``(H, W, 3)`` or ``(H, W)`` uint8. Of images with channels that differ the answer is no, and so it is of
+            scenes without colours, whose mosaic is a grey image.
+    """
+    grey = image.reshape(*image.shape[:2], -1)
+    if min(grey.shape[:2]) < 8 or (grey[..., :1] != grey).any():
+        return False
+    values = grey[..., 0].astype(np.float32)
+    return all(
+        np.abs(part[1:] - part[:-1]).mean() > _ALTERNATES * max(np.abs(part[2:] - part[:-2]).mean(), 1e-3)
+        for part in (values, values.T)
+    )
 
 
 class FieldTest:

@@ -50,6 +50,24 @@ def holds_several(source: Path) -> bool:
         return False
 
 
+def white_value(source: Path) -> int | None:
+    """The value of white that a PGM or PPM file states, where OpenCV leaves the pixels as they are stored.
+
+    Args:
+        source: file; only one whose name ends as theirs is looked into.
+    """
+    if source.suffix.lower() not in (".pgm", ".ppm", ".pnm"):
+        return None
+    try:
+        with source.open("rb") as file:
+            words = _pnm_words(file)
+            value = _number(words[3])
+    except (OSError, ValueError, IndexError):
+        return None
+    is_stored = words[0] in (b"P5", b"P6") or (value > 255 and words[0] in (b"P2", b"P3"))  # text of 8 bits is scaled
+    return value if is_stored and 0 < value < 65535 and value != 255 else None
+
+
 def _has_second_page(file: BinaryIO, head: bytes) -> bool:
     """True if another directory follows the first one that is no reduced copy or mask of it (tag 254)."""
     order, big = ("<" if head[:2] == b"II" else ">"), head[2:4] in (b"+\0", b"\0+")
@@ -152,14 +170,18 @@ def _webp(head: bytes) -> tuple[int, int] | None:
 
 
 def _pnm(file: BinaryIO) -> tuple[int, int] | None:
-    file.seek(0)
-    lines = [line.split(b"#")[0] for line in file.read(4096).splitlines()]
-    words = b" ".join(lines).split()
+    words = _pnm_words(file)
     if words[0] == b"P7":  # PAM: keys with values
         return _number(words[words.index(b"WIDTH") + 1]), _number(words[words.index(b"HEIGHT") + 1])
     if words[0] not in (b"P1", b"P4") and len(words) < 4:  # without the largest value, the height may be cut
         return None
     return _number(words[1]), _number(words[2])
+
+
+def _pnm_words(file: BinaryIO) -> list[bytes]:
+    file.seek(0)
+    lines = [line.split(b"#")[0] for line in file.read(4096).splitlines()]
+    return b" ".join(lines).split()
 
 
 def _number(word: bytes) -> int:

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.core.text import visible
 from dvo.data.files.files import read_image_file
-from dvo.data.images.image_header import MAX_PIXELS, image_size
+from dvo.data.images.image_header import MAX_PIXELS, image_size, white_value
 from dvo.data.images.orientation import oriented
 from dvo.data.images.reduction import Reduction
 
@@ -23,6 +24,7 @@ UNREAD = frozenset(
      ".rw2", ".gif"}
 )  # fmt: skip
 """Endings of images that are not read: of phones, of cameras, and moving ones."""
+_LAST, _WRAPPED = 9999, 4  # number behind which cameras begin anew; files among which that is looked for
 _HEXADECIMAL = re.compile(r"[0-9a-f]+")
 
 
@@ -50,6 +52,22 @@ def in_order(files: Sequence[Path]) -> list[Path]:
     return sorted(files, key=lambda path: natural_key(path.name))
 
 
+def _counted_on(files: list[Path], warnings: list[str] | None) -> list[Path]:
+    """Files whose numbers begin anew behind 9999, as those of cameras do, in the order in which they were taken."""
+    found = [re.fullmatch(r"(.*?)0?([0-9]{4})", path.stem) for path in files]
+    if len(files) < _WRAPPED or not all(found) or len({one[1] for one in found if one}) != 1:
+        return files
+    numbers = np.array([int(one[2]) for one in found if one])
+    steps = np.diff(numbers)
+    k = int(steps.argmax()) + 1
+    others = np.delete(steps, k - 1).max()
+    if numbers[0] > 1 or numbers[-1] != _LAST or steps[k - 1] <= max(10 * others, len(files)):
+        return files
+    if warnings is not None:
+        warnings.append(f"the names count from {visible(files[-1].name)} on with {visible(files[0].name)}")
+    return files[k:] + files[:k]
+
+
 def list_images(folder: Path, warnings: list[str] | None = None) -> list[Path]:
     """List the image files directly in a folder, in natural order; hidden ones left out.
 
@@ -63,7 +81,7 @@ def list_images(folder: Path, warnings: list[str] | None = None) -> list[Path]:
     if not folder.is_dir():
         return []
     files = [path for path in folder.iterdir() if not path.name.startswith(".")]
-    found = in_order([path for path in files if path.suffix.lower() in SUFFIXES])
+    found = _counted_on(in_order([path for path in files if path.suffix.lower() in SUFFIXES]), warnings)
     unread = [] if warnings is None else [path for path in files if path.suffix.lower() in UNREAD]
     if unread and warnings is not None:
         kinds = ", ".join(sorted({path.suffix.lower()[1:].upper() for path in unread}))
@@ -158,7 +176,7 @@ def read_image(
 
 
 def converted(image: np.ndarray, path: Path, bits: int = 16) -> np.ndarray:
-    """Convert the decoded image of a file, see :func:`to_rgb8`.
+    """Convert the decoded image of a file, see :func:`to_rgb8`; of a PGM or PPM by the value of white that it states.
 
     Args:
         image: as OpenCV decodes it.
@@ -171,6 +189,9 @@ def converted(image: np.ndarray, path: Path, bits: int = 16) -> np.ndarray:
     Raises:
         DvoError: pixels that are no colours (float).
     """
+    white = white_value(path)
+    if white is not None:
+        image = np.minimum(image.astype(np.float32) * (255 / white) + 0.5, 255).astype(np.uint8)
     try:
         return to_rgb8(image, bits)
     except DvoError as error:
@@ -226,6 +247,8 @@ def decode_bytes(
     upright = size[::-1] if orientation > 4 else size
     if reduction is not None and reduction.is_exact and reduction.recorded == upright and data.startswith(b"\xff\xd8"):
         mode = _reduced_modes().get(reduction.factor, mode)  # the decoder of JPEG files does less work then
+    if data[:2] in (b"P1", b"P2", b"P3"):  # the last number ends with the file
+        data += b"\n"
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode)
     except cv2.error:

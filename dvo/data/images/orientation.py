@@ -1,4 +1,4 @@
-"""Images turned as the EXIF data of JPEG files ask for, such as those of a phone that was held upright."""
+"""Images turned and mirrored as their EXIF data ask for, such as those of a phone that was held upright."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ import numpy as np
 from dvo.data.files.files import is_file
 from dvo.data.images import exif
 
+MIRRORED = (
+    "frames are mirrored, as the file asks for (front cameras do): if it holds what the camera saw, the path is that of"
+    " a mirror image"
+)
 _LOOKED_AT = 9
 _ZOOM = 1.02  # ratio of focal lengths above which the lens has zoomed; focusing changes them less
 _MIRRORED = (2, 4, 5, 7)
@@ -23,7 +27,7 @@ def common_orientation(images: list[Path], warnings: list[str]) -> int:
 
     Args:
         images: files in order, at least one.
-        warnings: receives a sentence if the images do not agree.
+        warnings: receives a sentence if the images do not agree, or are mirrored.
 
     Returns:
         Orientation of EXIF, 1 to 8; 1 (as stored) if they do not agree.
@@ -33,6 +37,7 @@ def common_orientation(images: list[Path], warnings: list[str]) -> int:
         return 1
     found = some if len(some) > 1 else {_orientation(image) for image in images}
     if len(found) == 1:
+        warnings += [MIRRORED] * mirrors(min(found))
         return found.pop()
     warnings.append("the EXIF data of the images state different orientations: they are read as stored, not turned")
     return 1
@@ -71,6 +76,15 @@ def turn(orientation: int) -> int:
     return _CLOCKWISE[orientation]
 
 
+def mirrors(orientation: int) -> bool:
+    """True for an orientation that shows images mirrored.
+
+    Args:
+        orientation: of EXIF, 1 to 8.
+    """
+    return orientation in _MIRRORED
+
+
 def oriented(image: np.ndarray, orientation: int) -> np.ndarray:
     """Turn an image for display.
 
@@ -81,7 +95,8 @@ def oriented(image: np.ndarray, orientation: int) -> np.ndarray:
     Returns:
         Image of the same type, ``(W, H)`` in size for the orientations 5 to 8.
     """
-    if orientation == 1:
-        return image
-    mirrored = image[:, ::-1] if orientation in _MIRRORED else image
-    return np.ascontiguousarray(np.rot90(mirrored, -turn(orientation) // 90))
+    import cv2
+
+    image = cv2.flip(image, 1) if mirrors(orientation) else image
+    turns = (cv2.ROTATE_90_CLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_COUNTERCLOCKWISE)
+    return cv2.rotate(image, turns[turn(orientation) // 90 - 1]) if turn(orientation) else image

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ _ROLES = {
     "other": {
         "mask", "masks", "seg", "semantic", "semantics", "label", "labels", "instance", "normal", "normals", "flow",
         "ir", "infra", "infrared", "conf", "confidence", "uncertainty", "albedo", "alpha", "thumb", "aligned",
-        "disp", "disparity",
+        "disp", "disparity", "nir", "swir", "lwir", "thermal",
     },
     "left": {"left", "l", "lft"},
     "colour": {"color", "colour", "rgb", "image", "images", "img", "im", "frame", "col", "c"},
@@ -32,6 +33,7 @@ _CAMERA = re.compile(
 )  # fmt: skip
 _FEW = 8  # cameras whose numbers stand in names
 _LEAST = 2  # images of a stream
+_RECORDING = 4  # images of one of several recordings, at least
 _COMMON = 0.5  # of the numbers of the smaller stream, that the other has too
 _REMEDY = "put the images of one stream into a folder of their own"
 
@@ -43,7 +45,7 @@ class Streams:
     Attributes:
         images: of the stream, in the order given.
         depth, right: files that belong to the images; None for none.
-        note: sentence about the choice; None if there is one stream.
+        note: sentence about the choice, or about names that are not those of one recording; None for none.
     """
 
     images: list[Path]
@@ -79,7 +81,7 @@ def split_streams(images: Sequence[Path], folder: Path) -> Streams:
     """
     groups = _by_words(images) or _by_camera(images)
     if len(groups) < 2:
-        return Streams(list(images))
+        return Streams(list(images), note=_odd_names(images) or _begun_anew(images))
     candidates = [group for group in groups if group.role in ("left", "colour", "plain")]
     if len(candidates) > 1:
         candidates = _by_content(candidates)
@@ -100,6 +102,37 @@ def split_streams(images: Sequence[Path], folder: Path) -> Streams:
     which = "the left one, " if chosen.role == "left" else ""
     note = f"several streams of images: reading {which}{chosen}; beside them are {'; '.join(parts)}"
     return Streams(chosen.files, found.get("depth"), found.get("right"), note)
+
+
+def _odd_names(images: Sequence[Path]) -> str | None:
+    """Note about the few images whose names are of another kind than the rest, such as ``preview.png``."""
+    kinds: dict[str, list[Path]] = {}
+    for image in images:
+        kinds.setdefault(re.sub(r"[0-9]+(?:\.[0-9]+)?", "*", image.stem), []).append(image)
+    usual = max(kinds.values(), key=len, default=[])
+    odd = [image for image in images if image not in set(usual)]
+    if not odd or len(odd) * _FEW > len(usual):
+        return None
+    return f"images with names of another kind are read too, in the order of the names: {_names(odd)}"
+
+
+def _begun_anew(images: Sequence[Path]) -> str | None:
+    """Note about names of several recordings, ``take1_0001.png`` and ``take2_0001.png``."""
+    fields = [re.findall(r"[0-9]+", image.stem) for image in images]
+    if len({re.sub(r"[0-9]+", "*", image.stem) for image in images}) != 1 or len(fields[0]) != 2:
+        return None
+    starts = [k for k in range(1, len(fields)) if fields[k][0] != fields[k - 1][0]]
+    blocks = [fields[start:end] for start, end in pairwise([0, *starts, len(fields)])]
+    same = len({int(block[0][1]) for block in blocks}) == 1
+    if not (1 <= len(starts) < _FEW and same and min(map(len, blocks)) >= _RECORDING):
+        return None
+    names = _names([images[start] for start in starts])
+    return f"the numbers of the names begin anew at {names}: several recordings are to be tracked one by one"
+
+
+def _names(images: Sequence[Path]) -> str:
+    shown = ", ".join(visible(image.name) for image in images[:3])
+    return shown + (f" and {len(images) - 3} more" if len(images) > 3 else "")
 
 
 def choose_folder(folders: Sequence[Path]) -> Path | None:

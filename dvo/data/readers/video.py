@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.core.text import visible
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.files.files import is_file, lookups
 from dvo.data.files.output import spelled_in_text
@@ -25,11 +26,13 @@ from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
 from dvo.data.images.fields import DEINTERLACE, INTERLACED, LOOKED_AT, are_interlaced
 from dvo.data.images.image_header import MAX_PIXELS
 from dvo.data.images.images import SUFFIXES, to_rgb8
+from dvo.data.images.orientation import MIRRORED, mirrors, oriented, turn
 from dvo.data.inertial import InertialSamples
 from dvo.data.inertial_files.gopro import gopro_notes, read_gopro, read_gopro_positions
 from dvo.data.inertial_files.gpmf import has_telemetry
 from dvo.data.positions import Positions
-from dvo.data.readers.edit_list import is_mirrored, shown_seconds
+from dvo.data.readers.avi_index import is_misindexed
+from dvo.data.readers.container import count_videos, is_sphere, is_whole, orientation, shown_seconds
 from dvo.data.recording import EVERYTHING, Log, RawFrame, Reader, Recording, Request, Selection
 from dvo.data.trajectory import Trajectory
 
@@ -40,6 +43,7 @@ if TYPE_CHECKING:
 # Half a minute of 30 Hz video without a frame is taken for the end.
 _GIVE_UP_AFTER = 900
 _JUMP = 5000.0  # milliseconds: frames in another order than that of their times lie far less apart
+_HELD_BACK = 4  # frames that a codec needs before it gives the first one
 _BINARY = re.compile(rb"[^\t\n\r\x0c\x20-\x7e\x80-\xff]")
 _NAMES_FILES = re.compile(rb"(\xef\xbb\xbf)?\s*(ffconcat|#EXTM3U|<\?xml|v=0)", re.IGNORECASE)
 _SECONDS = 4  # to open, and to find the next frame: gigabytes without one are no video
@@ -68,18 +72,8 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
         raise DvoError("a text file is no video", file=path, remedy="give a video or the folder that holds the images")
     if path.suffix.lower() in SUFFIXES:  # FFmpeg would read it as a video of one frame
         raise DvoError("one image is no video", file=path, remedy="give the folder that holds the images")
-    # FFmpeg reports every damaged block on stderr, thousands of lines in one bad video; we count frames instead
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(0)
-    try:
-        # FFmpeg only: OpenCV's other backends would read foo_01.png as a video of all its siblings
-        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 1000 * _SECONDS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1000 * _SECONDS]
-        with spelled_in_text(path) as name:
-            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, limits)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-    try:
+    with ExitStack() as opened:
+        capture = _open(path, opened)
         if not capture.isOpened() and (other := _no_video(path, head)) is not None:
             raise DvoError(f"{other} is no video", file=path, remedy="give a video or the folder that holds the images")
         if not capture.isOpened():
@@ -93,13 +87,38 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
         if size[0] * size[1] > MAX_PIXELS:
             message = f"frames of {size[0]:g}x{size[1]:g} pixels, more than {MAX_PIXELS:,}"
             raise DvoError(message, file=path, remedy="reduce the video")
-        yield capture
-    except cv2.error as error:
-        raise DvoError(
-            f"this video does not decode ({str(error).splitlines()[0][:200]})", file=path, remedy="check that it plays"
-        ) from None
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # it does not mirror, and turns by a wrong angle where it should
+        try:
+            yield capture
+        except cv2.error as error:
+            reason = str(error).splitlines()[0][:200]
+            raise DvoError(f"this video does not decode ({reason})", file=path, remedy="check that it plays") from None
+
+
+def _open(path: Path, opened: ExitStack) -> cv2.VideoCapture:
+    """A video that is closed with the stack, and that may not have been opened."""
+    import cv2
+
+    # FFmpeg reports every damaged block on stderr, thousands of lines in one bad video; we count frames instead
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(0)
+    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 1000 * _SECONDS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1000 * _SECONDS]
+    try:
+        with spelled_in_text(path) as name:
+            if is_in_order := is_misindexed(path):  # of a pipe FFmpeg reads no index, but chunk after chunk
+                number = os.open(path, os.O_RDONLY)
+                opened.callback(os.close, number)
+                name = f"pipe:{number}"
+            # FFmpeg only: OpenCV's other backends would read foo_01.png as a video of all its siblings
+            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, limits)
     finally:
-        capture.release()
+        cv2.utils.logging.setLogLevel(level)
+    if is_in_order and not capture.isOpened():
+        remedy = f"write it anew: ffmpeg -i - -c copy OUT.avi < {path.name}"
+        raise DvoError("the index of the video is damaged", file=path, remedy=remedy)
+    opened.callback(capture.release)
+    return capture
 
 
 def _no_video(path: Path, head: bytes) -> str | None:
@@ -118,10 +137,10 @@ def _no_video(path: Path, head: bytes) -> str | None:
     return None
 
 
-def _is_row_of_jpegs(path: Path) -> bool:
-    """True for JPEG images one after the other, without a container: FFmpeg gives them the times of 25 a second."""
+def _head(path: Path) -> bytes:
+    """The first bytes, which tell the container."""
     with lookups(path), path.open("rb") as file:
-        return file.read(2) == b"\xff\xd8"
+        return file.read(12)
 
 
 def _does_not_convert(path: Path) -> bool:
@@ -144,6 +163,12 @@ def _does_not_convert(path: Path) -> bool:
         except (OSError, subprocess.TimeoutExpired):
             return False
     return b"interlaced" in said
+
+
+def _codec(code: float) -> str:
+    """Name of a codec in brackets, of its four letters; nothing for another number."""
+    name = int(code).to_bytes(4, "little") if 0 < code < 2**32 else b""
+    return f" (codec {name.decode()})" if name.isalnum() else ""
 
 
 def _grabs(capture: cv2.VideoCapture) -> Iterator[tuple[int, float, int]]:
@@ -205,11 +230,12 @@ class VideoRecording:
 
     Attributes:
         rate: frames a second that the file states, or the user; None with a list of times.
-        turned: degrees by which frames are turned to stand upright, as the file asks for; their rows are then not the
-            rows of the sensor in the order in which it reads them.
+        orientation: of EXIF, by which frames are turned and mirrored, as the file asks for.
+        turned: degrees clockwise of it; rows are then not the rows of the sensor in the order in which it reads them.
 
     Raises:
-        DvoError: it does not open, holds no frame, or ``times`` has another number of rows than it has frames.
+        DvoError: it does not open, holds no frame, shows all around without a calibration, or ``times`` has another
+            number of rows than it has frames.
     """
 
     kind = "video"
@@ -229,15 +255,19 @@ class VideoRecording:
         self.warnings: list[str] = []
         with _capture(path) as capture:
             announced, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
-            angle = capture.get(cv2.CAP_PROP_ORIENTATION_META) % 360
-            does_turn = capture.get(cv2.CAP_PROP_ORIENTATION_AUTO) and angle in (90, 180, 270)
-            self.turned = int(angle) if does_turn else 0
-            width, height = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+            angle = round(capture.get(cv2.CAP_PROP_ORIENTATION_META)) % 360
+            self.orientation = orientation(path) or {90: 6, 180: 3, 270: 8}.get(angle, 1)
+            self.turned = turn(self.orientation)
+            size = [capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+            width, height = reversed(size) if self.orientation > 4 else size
             self._square = _square_size(width, height, _aspect(capture), self.turned, request.calibration)
+            code = capture.get(cv2.CAP_PROP_FOURCC)
             first, interlaced = self._look(capture)
+        head = _head(path)
         if not first:
-            raise DvoError("no frame of this video decodes", file=path, remedy="check that it plays, or re-encode it")
-        if interlaced:
+            remedy = "check that it plays, or re-encode it: ffmpeg -i VIDEO -c:v libx264 OUT.mp4"
+            raise DvoError(f"no frame of this video decodes{_codec(code)}", file=path, remedy=remedy)
+        if interlaced and not head.startswith(b"GIF"):  # whose few colours may be a pattern of lines
             self.warnings.append(INTERLACED)
         # containers without a count give huge or negative numbers
         self.frame_count: int | None = int(announced) if 0 < announced < 1e9 else None
@@ -246,8 +276,20 @@ class VideoRecording:
             self.warnings.append(
                 f"the pixels of the video are not square: images of {width:g}x{height:g} are resized to {wide}x{high}"
             )
-        if is_mirrored(path):
-            self.warnings.append("the file asks for mirrored frames, as of a front camera: they are not mirrored")
+        self.warnings += [MIRRORED] * mirrors(self.orientation)
+        if (count := count_videos(path)) > 1:
+            self.warnings.append(
+                f"the file holds {count} videos, of which the first is read: another one is "
+                f"ffmpeg -i {visible(path.name)} -map 0:v:1 -c copy OUT{visible(path.suffix)}"
+            )
+        if is_misindexed(path):
+            self.warnings.append("the index of the file is damaged: frames are read in the order in which they lie")
+        if is_sphere(path):
+            message = "the file says that its images show all around (equirectangular, or the like)"
+            if request.calibration is None:
+                remedy = "make a flat view of it: ffmpeg -i VIDEO -vf v360=e:flat:h_fov=90:v_fov=60 OUT.mp4"
+                raise DvoError(message, file=path, remedy=remedy)
+            self.warnings.append(f"{message}: they are read as those of the calibration")
         shown = shown_seconds(path)
         if shown is not None and self.frame_count is not None and RATES[0] <= rate <= RATES[1]:
             # the frames before and behind what is shown are counted, and not decoded
@@ -257,13 +299,18 @@ class VideoRecording:
         if has_telemetry(path):
             self.warnings += gopro_notes(path)
             self.positions = partial(read_gopro_positions, path)
-            if request.times is None and request.fps is None and self._use_container:
+            if mirrors(self.orientation):
+                self.warnings.append("inertial samples of the telemetry are not used: frames are mirrored")
+            elif request.times is None and request.fps is None and self._use_container:
                 self.inertial = partial(read_gopro, path, self.turned)
             else:
                 self.warnings.append("inertial samples of the telemetry are not used: frames have no times of the file")
         self._fps = fps or (rate if np.isfinite(rate) and RATES[0] <= rate <= RATES[1] else NOMINAL_FPS)
         self.rate = self._fps if self._times is None else None
-        is_stated = self._use_container and not _is_row_of_jpegs(path)
+        is_stated = self._use_container and not head.startswith(
+            b"\xff\xd8"
+        )  # of JPEGs in a row FFmpeg gives 25 a second
+        self._is_counted = head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free") or head.startswith(b"RIFF")
         if self._times is None and not is_stated and request.fps is None:
             known = "the stated" if self._fps == rate else "a guessed"
             self.warnings.append(
@@ -285,7 +332,7 @@ class VideoRecording:
                 if decoded and image is not None:
                     repeats = repeats or (previous is not None and np.array_equal(previous, image))
                     previous = image
-                    yield image.swapaxes(0, 1) if self.turned in (90, 270) else image
+                    yield image
 
         looked_at = images()
         interlaced = are_interlaced(looked_at)
@@ -335,6 +382,7 @@ class VideoRecording:
                     log.unreadable.append(f"frame {index}")
                     continue
                 previous = timestamp
+                image = oriented(image, self.orientation)
                 if self._square is not None:
                     image = cv2.resize(image, self._square, interpolation=cv2.INTER_LINEAR)
                 image = image if selection.reduction is None else selection.reduction(image)
@@ -342,9 +390,10 @@ class VideoRecording:
         missing = (self.frame_count or 0) - read - len(log.unreadable)
         if self._use_container and missing > 0:  # of a variable rate the announced number may be rate times duration
             missing = min(missing, round((self.frame_count or 0) - 1 - last / 1000 * self._fps))
-        if missing > 0 and selection.interval.end is None:
-            # healthy files may be off by a frame or so: estimated counts, edit lists
-            verdict = ": it is cut short or damaged" if missing > max(1, (self.frame_count or 0) // 200) else ""
+        if missing > 0 and selection.interval.end is None and (log.unreadable or not is_whole(self.path)):
+            # healthy files may be off by a frame or so: edit lists, counts by a duration that begins before the images
+            spare = max(1 if self._is_counted else _HELD_BACK, (self.frame_count or 0) // 200)
+            verdict = ": it is cut short or damaged" if missing > spare else ""
             log.notes.append(f"the video announces {self.frame_count} frames, {read} could be read{verdict}")
 
     def _time(self, index: int, milliseconds: float) -> float | None:

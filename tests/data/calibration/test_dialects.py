@@ -484,6 +484,17 @@ def depthai(*cameras):
 
 
 OAK = [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
+TOML = """[cam_0]
+name = "A"
+size = [ 640, 480,]
+matrix = [ [ 500.0, 0.0, 320.0,], [ 0.0, 510.0, 240.0,], [ 0.0, 0.0, 1.0,],]
+distortions = {}
+rotation = [ 0.0, 0.0, 0.0,]
+{}
+[metadata]
+adjusted = false
+error = 0.5
+"""
 READ = [
     ("slam2.yaml", SLAM, NUMBERS, "radtan", FIVE, (640, 480)),
     ("slam2_stereo.yaml", SLAM + STEREO, NUMBERS, "radtan", FIVE, (640, 480)),
@@ -663,6 +674,12 @@ READ = [
     ("oak_w.json", depthai((1, OAK, [*KC, *[0.0] * 10])), NUMBERS, "fisheye", KC, (640, 480)),
     ("record3d.json", json.dumps({"w": 640, "h": 480, "fps": 60, "K": [500, 0, 0, 0, 510, 0, 320, 240, 1],
      "cameraType": 1, "perFrameIntrinsicCoeffs": [[500, 510, 320, 240]] * 3, }), NUMBERS, "none", (), (640, 480)),
+    ("nerfies.json", json.dumps({"focal_length": 500.0, "principal_point": [320.0, 240.0], "skew": 0.0,
+     "pixel_aspect_ratio": 1.02, "radial_distortion": [0.1, -0.2, 0.05], "tangential_distortion": [0.003, 0.004],
+     "image_size": [640, 480]}), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("anipose.toml", TOML.format("[0.1, -0.2, 0.003, 0.004, 0.05,]", ""), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("anipose_wide.toml", TOML.format("[0.1, -0.2, 0.003, 0.004]", "fisheye = true"), NUMBERS, "fisheye", KC,
+     (640, 480)),
     ("a.pincam", "640 480 500 510 320 240\n", NUMBERS, "none", (), (640, 480)),
     ("calib_cam_to_cam.txt", KITTI_RAW, (721.5377, 721.5377, 609.5593, 172.854), "none", (), (1242, 375)),
     ("kitti_recorded.txt", KITTI_RAW.replace("_rect", "_left"), (984.2439, 980.8141, 690, 233.1966), "radtan",
@@ -722,6 +739,7 @@ LENS_KEYS = [
     "poly_parameters: {p0: 1.0, p1: 2.0}", "Camera.kappa: 0.3", "inner: {distortion_coefficients: [0.1, 0, 0, 0]}",
     "undocumented: {fisheye: true, k1: 0.2}", "curvature: -0.1",
     "mapping: equisolid", "optics_kind: stereographic", "wide_angle: true", "distortion_coefficients: some",
+    "resolution: {width: 640, height: 480, distort: {type: DISTORT_FTHETA, coeffs: [0.1, -0.2, 0.02, 0.001]}}",
     "cam_d0: [0.1]\nmodel: none", "camera_k7: 0.1", "disto_k3: [-0.2, 0.05, 0.01]",
 ]  # fmt: skip
 
@@ -873,6 +891,9 @@ REFUSED = [
     ("profile.json", json.dumps(GYROFLOW | {"digital_lens": "gopro_superview"}), "digital_lens: 'gopro_superview'"),
     ("profile.json", json.dumps(GYROFLOW | {"distortion_model": "poly5"}), "distortion_model: 'poly5'"),
     ("profile.json", json.dumps(GYROFLOW | {"fisheye_params": 3}), "not a mapping"),
+    ("aspect.yaml", "focal_length: 500\naspect_ratio: 1.02\ncx: 320\ncy: 240\n", "aspect_ratio: 1.02 beside one"),
+    ("cut.toml", "[cam_0]\nmatrix = [ [ 500.0,", "not valid TOML"),
+    ("own.toml", TOML.format("[0.1, -0.2]", "warp = [0.1, 0.2, 0.3, 0.4, 0.5]"), "2 coefficients"),
 ]  # fmt: skip
 
 

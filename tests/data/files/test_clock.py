@@ -46,6 +46,9 @@ def test_decimal_seconds_stay_seconds(rate, start, count):
         ("0.000\n16.683\n33.367\n", [0, 0.01668, 0.03337]),
         ("33333333\n66666667\n", [0, 0.03333]),
         ("0\n1\n2\n", [0, 1, 2]),
+        ("133000000000000000\n133000000000333333\n", [0, 0.0333333]),  # ticks of Windows, of a HoloLens
+        ("ticks\n638000000000000000\n638000000000333333\n", [0, 0.0333333]),  # of .NET
+        (",time\n0,0.5\n1,0.6\n", [0, 0.1]),  # pandas
     ],
 )
 def test_columns_headers_and_units(make, text, expected):
@@ -79,6 +82,10 @@ HEADERS = {
     "33333333,7,1,2,3,.9,.1,.2,.3,4,5,6",
     "time [s],idx,posx,posy,posz,rotx,roty,rotz,rotw,max": ".033333333,7,1,2,3,.1,.2,.3,.9,8",
     "sec,nsec,x,y,z,qx,qy,qz,qw": "0,33333333,1,2,3,.1,.2,.3,.9",
+    ",t_ns,x,y,z,qx,qy,qz,qw": "7,33333333,1,2,3,.1,.2,.3,.9",
+    "graph_uid,tracking_timestamp_ns,utc_timestamp_ns,tx_world_device,ty_world_device,tz_world_device,qx_world_device,"
+    "qy_world_device,qz_world_device,qw_world_device,device_linear_velocity_x_device,gravity_x_world":
+    "a-b,33333333,99,1,2,3,.1,.2,.3,.9,4,5",
     "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.child_frame_id,field.pose.pose.position.x,"
     "field.pose.pose.position.y,field.pose.pose.position.z,field.pose.pose.orientation.x,field.pose.pose.orientation.y,"
     "field.pose.pose.orientation.z,field.pose.pose.orientation.w": "99,7,33333333,map,camera,1,2,3,.1,.2,.3,.9",
@@ -126,6 +133,35 @@ def test_a_time_and_a_matrix_in_a_row(make, last):
     np.testing.assert_allclose(counted.poses_wc, expected[:2], atol=1e-12)
     with pytest.raises(DvoError, match="line 1: (the matrix is no rotation|the last row of the matrix)"):
         read_groundtruth(make.text("k.txt", "1 0 0 0 0 1 0 0 0 0 " + ("1 0 1 0 0 1" if last else "2 0")), np.zeros(1))
+
+
+def test_a_time_and_a_matrix_column_by_column(make):
+    rows = [f"{i / 10:.1f} 0 1 0 0 -1 0 0 0 0 0 1 0 {i} 2 3 1\n" for i in range(4)]
+    found = read_tum(make.text("arkit.txt", "".join(rows)))
+    expected = [[i, 2, 3, 0, 0, np.sqrt(0.5), np.sqrt(0.5)] for i in range(4)]
+    np.testing.assert_allclose(found.poses_wc, expected, atol=1e-12)
+
+
+def test_seventeen_numbers_are_euroc_s_only_with_nanoseconds(make):
+    state = "1 2 3 .9 .1 .2 .3 " + "0 " * 9
+    for time in ("1403636580838555648", "1.403636580838555648e+18"):
+        found = read_tum(make.text("t.txt", f"{time} {state}\n"))
+        assert found.timestamps[0] == pytest.approx(1403636580.838555648) and found.poses_wc[0, 6] > 0.9
+    with pytest.raises(DvoError, match="line 1: 17 numbers without a header.*Name the columns"):
+        read_tum(make.text("t.txt", f"1403636580.838555 {state}\n"))
+
+
+def test_times_that_have_lost_their_digits(make):
+    rows = [f"{1403636580 + 0.05 * i:.5e} {i} 0 0 0 0 0 1\n" for i in range(9)]
+    with pytest.raises(DvoError, match="line 2: 8 of 9 rows have the time of the row before.*all their digits"):
+        read_tum(make.text("t.txt", "".join(rows)))
+    assert len(read_tum(make.text("t.txt", rows[0] * 9))) == 1  # of TUM's own, some rows stand twice
+
+
+def test_times_in_days_are_no_seconds(make):
+    rows = "".join(f"{45322.5 + 0.05 * i / 86400:.10f}\n" for i in range(9))
+    with pytest.raises(DvoError, match="times: 1,7.*images a second"):
+        read_times(make.text("t.csv", rows), 9)
 
 
 def test_quotes_around_fields(make):

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dvo.data.images.fields import are_interlaced
+from dvo.data.images.fields import are_interlaced, is_mosaic
 from tests.support.interlaced import moving, woven
 
 
@@ -41,3 +41,15 @@ def test_fine_lines_are_no_fields():
 @pytest.mark.parametrize("pictures", [[], [np.zeros((2, 2, 3), np.uint8)] * 5, list(moving(2, 3))])
 def test_too_little_to_say(pictures):
     assert not are_interlaced(pictures)
+
+
+def test_mosaics_of_a_sensor():
+    """Each pixel of one colour; noise, combs of lines alone and images with colours are none."""
+    random = np.random.default_rng(5)
+    small = cv2.resize(random.integers(0, 256, (12, 16, 3), dtype=np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
+    mosaic = small[..., 1].copy()
+    mosaic[::2, ::2], mosaic[1::2, 1::2] = small[::2, ::2, 0], small[1::2, 1::2, 2]
+    assert is_mosaic(mosaic) and is_mosaic(np.repeat(mosaic[..., None], 3, 2))
+    combs = small[..., 1] // 2 + 40 * (np.arange(240)[:, None] % 2).astype(np.uint8)
+    noise = random.integers(0, 256, (240, 320), dtype=np.uint8)
+    assert not any(map(is_mosaic, (small, small[..., 1], noise, combs, np.zeros((240, 320), np.uint8), mosaic[:4])))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dvo.data.images.image_header import holds_several, image_size
-from dvo.data.images.images import is_complete
+from dvo.data.images.images import is_complete, read_image
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tif", ".webp", ".pgm", ".ppm", ".pam"])
@@ -115,3 +115,18 @@ def test_reduced_copies_and_masks_in_a_tiff_are_no_pages(tmp_path: Path, kind: i
     assert holds_several(file)
     file.write_bytes((head + page(0, start + directory))[:-1])
     assert not holds_several(file)
+
+
+@pytest.mark.parametrize("white", [31, 100, 255, 1023, 4095, 65535])
+@pytest.mark.parametrize("kind", ["P2", "P3", "P5", "P6"])
+def test_the_value_of_white_of_a_pgm(tmp_path: Path, white: int, kind: str) -> None:
+    """OpenCV leaves most of them as they are stored; text need not end with a line."""
+    channels = 3 if kind in ("P3", "P6") else 1
+    levels = np.linspace(0, white / 2, 37 * 53 * channels).round().astype(int).reshape(37, 53, channels)
+    pixels = " ".join(map(str, levels.ravel())).encode()
+    if kind in ("P5", "P6"):
+        pixels = levels.astype(">u2" if white > 255 else np.uint8).tobytes()
+    file = tmp_path / ("a.ppm" if channels == 3 else "a.pgm")
+    file.write_bytes(f"{kind}\n# a comment 7\n53 37\n{white}\n".encode() + pixels)
+    image = read_image(file)
+    assert image is not None and np.abs(image - levels * (255 / white)).max() <= 1

@@ -1,7 +1,8 @@
-"""EXIF orientation of folders of JPEG files."""
+"""EXIF orientation of folders of image files."""
 
 import json
 import struct
+import zlib
 from dataclasses import replace
 
 import cv2
@@ -55,8 +56,32 @@ def test_images_stand_upright(make, orientation, order):
     assert [frame.image.shape for frame in frames] == [(*size, 3)] * 3
     for frame, image in zip(frames, shown(path), strict=True):
         assert np.array_equal(frame.image, image) and frame.image.flags.carray
-    assert source.turned == TURNED[orientation] and source.warnings == []
+    assert source.turned == TURNED[orientation]
+    assert ["mirrored" in warning for warning in source.warnings] == [True] * (orientation in (2, 4, 5, 7))
     assert exif.orientation(path / "0.jpg") == orientation
+
+
+@pytest.mark.parametrize("orientation", [1, 2, 6, 8])
+@pytest.mark.parametrize("suffix", [".png", ".webp"])
+def test_png_and_webp_stand_upright(make, suffix, orientation):
+    """As programs write that convert photographs and keep their EXIF data."""
+    image = make.image(0)
+    code = cv2.imencode(suffix, image, [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()  # lossless
+    segment = with_orientation(b"\xff\xd8", orientation)
+    tiff = segment[segment.index(b"II*\0") :]
+    if suffix == ".png":
+        chunk = b"eXIf" + tiff
+        code = code[:33] + struct.pack(">I", len(tiff)) + chunk + struct.pack(">I", zlib.crc32(chunk)) + code[33:]
+    else:
+        code += b"EXIF" + struct.pack("<I", len(tiff)) + tiff + bytes(len(tiff) % 2)
+        code = code[:4] + struct.pack("<I", len(code) - 8) + code[8:]
+    (make.root / "images").mkdir()
+    for index in range(3):
+        (make.root / "images" / f"{index}{suffix}").write_bytes(code)
+    source = open_source(make.root / "images", calib=UPRIGHT if orientation > 4 else SENSOR, fps=10)
+    assert source.turned == TURNED[orientation]
+    expected = {1: image, 2: image[:, ::-1], 6: np.rot90(image, -1), 8: np.rot90(image)}[orientation]
+    assert all(np.array_equal(frame.image, expected[..., ::-1]) for frame in source)
 
 
 @pytest.mark.parametrize("stated", [0, 9, 65535, None])

@@ -36,6 +36,7 @@ def write(make, folder, *patterns, count=4):
         (("infra1_{:04d}.png", "infra2_{:04d}.png"), "right"),
         (("{:04d}_sensor-3.png", "{:04d}_sensor-5.png"), "right"),
         (("left-{}.png", "right-{}.png", "disparity_{}.png"), "right"),
+        (("{}_left.tiff", "{}_right.tiff", "{}_nir.tiff"), "right"),
     ],
 )
 def test_the_stream_of_colour_or_the_left_one_is_tracked(make, patterns, option):
@@ -223,6 +224,34 @@ def test_folders_that_no_name_tells_apart(make):
         write(make, name, "{:03d}.png")
     with pytest.raises(DvoError, match="several folders of images: back, front"):
         dvo.open(make.root, calib=make.calib(), fps=10)
+
+
+@pytest.mark.parametrize("pattern", ["DSC{:05d}.JPG", "IMG_{:04d}.JPG", "GOPR{:04d}.JPG"])
+def test_cameras_count_anew_behind_9999(make, pattern):
+    names = [pattern.format((9995 + i) % 9999 + 1) for i in range(8)]
+    source = dvo.open(make.images("clip", names), calib=make.calib(), fps=10)
+    assert [path.name for path in source.recording.images] == names
+    assert source.warnings == [f"the names count from {names[3]} on with {names[4]}"]
+    whole = [pattern.format(i) for i in (*range(1, 9000, 900), 9999)]  # every so many of a long recording
+    source = dvo.open(make.images("few", whole), calib=make.calib(), fps=10)
+    assert [path.name for path in source.recording.images] == whole and source.warnings == []
+
+
+def test_names_of_several_recordings_are_said(make):
+    takes = [f"take{take}_{i:03d}.png" for take in (1, 2) for i in range(4)]
+    source = dvo.open(make.images("takes", takes), calib=make.calib(), fps=10)
+    assert len(source) == 8 and "begin anew at take2_000.png" in " ".join(source.warnings)
+    parts = [f"part{part}_{4 * part + i:03d}.png" for part in (1, 2) for i in range(4)]
+    assert dvo.open(make.images("parts", parts), calib=make.calib(), fps=10).warnings == []
+
+
+def test_a_name_of_another_kind_is_said(make):
+    names = [f"{i:03d}.png" for i in range(8)]
+    source = dvo.open(make.images("odd", [*names, "preview.png"]), calib=make.calib(), fps=10)
+    assert len(source) == 9 and "another kind are read too" in " ".join(source.warnings)
+    assert "preview.png" in " ".join(source.warnings)
+    words = make.images("words", ["kitchen.png", "hall.png", "door.png", "room.png"])
+    assert dvo.open(words, calib=make.calib(), fps=10).warnings == []
 
 
 def test_hexadecimal_numbers_are_in_order(make):

@@ -140,6 +140,9 @@ class StampsLike:
         facts = {cv2.CAP_PROP_FRAME_COUNT: len(self.milliseconds), cv2.CAP_PROP_FPS: 25.0}
         return facts.get(key, self.milliseconds[max(self.position, 0)] if key == cv2.CAP_PROP_POS_MSEC else 0.0)
 
+    def set(self, key, value):
+        return True
+
     def retrieve(self):
         return True, np.zeros((120, 160, 3), np.uint8)
 
@@ -209,3 +212,73 @@ def test_files_that_are_no_video_at_all_are_named(tmp_path, content, what):
     (tmp_path / "clip.txt").write_bytes(content)
     with pytest.raises(DvoError, match=f"clip.txt: {what} is no video. Give a video or the folder"):
         open_source(tmp_path / "clip.txt", guess=True)
+
+
+def with_index(video, change):
+    """Change the entries ``(kind, flags, place, length)`` of the index at the end of an AVI."""
+    data = video.read_bytes()
+    at = data.rindex(b"idx1") + 8
+    (length,) = struct.unpack_from("<I", data, at - 4)
+    entries = change(list(struct.iter_unpack("<4s3I", data[at : at + length])))
+    video.write_bytes(data[:at] + b"".join(struct.pack("<4s3I", *entry) for entry in entries) + data[at + length :])
+
+
+INDEXES = {
+    "right": lambda entries: entries,
+    "shuffled": lambda entries: entries[::-1],
+    "one place": lambda entries: [(kind, flags, entries[3][2], length) for kind, flags, _, length in entries],
+    "other places": lambda entries: [(kind, flags, place + 6, length) for kind, flags, place, length in entries],
+}
+
+
+@pytest.mark.parametrize("index", INDEXES)
+def test_the_index_of_an_avi_is_believed_only_if_it_is_that_of_the_frames(make, index):
+    video = make.video("v.avi", "MJPG")
+    right = [frame.image for frame in open_source(video, calib=CALIB)]
+    with_index(video, INDEXES[index])
+    source = open_source(video, calib=CALIB)
+    frames = list(source)
+    assert len(frames) == 20 and all(np.array_equal(a.image, b) for a, b in zip(frames, right, strict=True))
+    assert [frame.timestamp for frame in frames] == pytest.approx(np.arange(20) / 20)
+    assert ["index of the file is damaged" in text for text in source.warnings] == [True] * (index != "right")
+
+
+def chunk(kind, content):
+    return kind + struct.pack("<I", len(content)) + content + bytes(len(content) % 2)
+
+
+def test_an_index_of_opendml_in_another_order(make):
+    """An index at the head of the stream that names the frames backwards."""
+    video = make.video("v.avi", "MJPG")
+    right = [frame.image for frame in open_source(video, calib=CALIB)]
+    data = video.read_bytes()
+
+    def parts(at, end):
+        while at + 8 <= end:
+            kind, length = struct.unpack_from("<4sI", data, at)
+            yield kind, data[at + 8 : at + 8 + length], at + 8
+            at += 8 + length + length % 2
+
+    lists = {content[:4]: (at + 4, at + len(content)) for kind, content, at in parts(12, len(data)) if kind == b"LIST"}
+    head = {kind: (content, at) for kind, content, at in parts(*lists[b"hdrl"])}
+    stream, at = head[b"LIST"]
+    kept = {kind: content for kind, content, _ in parts(at + 4, at + len(stream))}
+    frames = [content for kind, content, _ in parts(*lists[b"movi"]) if kind == b"00dc"]
+
+    def beginning(place, length):
+        index = struct.pack("<HBBI4s12xQII", 4, 0, 0, 1, b"00dc", place, length, len(frames))
+        strl = chunk(b"strh", kept[b"strh"]) + chunk(b"strf", kept[b"strf"]) + chunk(b"indx", index)
+        return chunk(b"LIST", b"hdrl" + chunk(b"avih", head[b"avih"][0]) + chunk(b"LIST", b"strl" + strl))
+
+    movie, places = b"movi", []
+    for content in frames:
+        places.append((12 + len(beginning(0, 0)) + 8 + len(movie) + 8, len(content)))
+        movie += chunk(b"00dc", content)
+    index = struct.pack("<HBBI4sQ4x", 2, 0, 1, len(places), b"00dc", 0)
+    index = chunk(b"ix00", index + b"".join(struct.pack("<II", *place) for place in reversed(places)))
+    place = 12 + len(beginning(0, 0)) + 8 + len(movie)
+    video.write_bytes(chunk(b"RIFF", b"AVI " + beginning(place, len(index)) + chunk(b"LIST", movie + index)))
+    source = open_source(video, calib=CALIB)
+    read = list(source)
+    assert all(np.array_equal(a.image, b) for a, b in zip(read, right, strict=True))
+    assert "damaged" in " ".join(source.warnings)

@@ -156,7 +156,7 @@ class TrackerConfig:
     optimisation: int = 8
     initial_frames: int = 5
     initial_updates: int = 16
-    final_updates: int = 8
+    final_updates: int = 2
     final_adjustment: bool = True
     estimate_readout: bool = True
     loops: bool = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
@@ -311,6 +312,7 @@ def track(
             observer.update(frame, estimate)
         progress.update(frame, estimate)
 
+    gc.freeze()  # modules and weights stay: a collection that looked through them would take longer than a frame
     with InterruptSwitch(getattr(clip, "stop", None)) as switch:
         with TrackingProgress(clip.frame_count) as progress:
             try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import gc
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
@@ -31,6 +30,7 @@ from dvo.commands.run_options import INPUTS
 from dvo.commands.scale import scale_observers, scale_settings, scaled_source
 from dvo.commands.streams import print_counts, stream_facts
 from dvo.commands.summary import Pages
+from dvo.core.allocator import without_old_garbage
 from dvo.core.errors import DvoError
 from dvo.core.settings import parse_settings, read_settings
 from dvo.data.files.output import check_place
@@ -312,8 +312,7 @@ def track(
             observer.update(frame, estimate)
         progress.update(frame, estimate)
 
-    gc.freeze()  # modules and weights stay: a collection that looked through them would take longer than a frame
-    with InterruptSwitch(getattr(clip, "stop", None)) as switch:
+    with without_old_garbage(), InterruptSwitch(getattr(clip, "stop", None)) as switch:
         with TrackingProgress(clip.frame_count) as progress:
             try:
                 done = session.run(

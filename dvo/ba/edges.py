@@ -8,6 +8,8 @@ filled up with empty places: then a sum over edges is a matrix product, and noth
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,6 +51,11 @@ class EdgePlan:
     @property
     def size(self) -> int:
         return self.filled.shape[1]
+
+    @cached_property
+    def layouts(self) -> dict[tuple[int, bytes], Any]:
+        """What sparse solutions of the graph share, by the number of unknowns and those of the frames."""
+        return {}
 
     def chunks(self) -> list[slice]:
         """Slices of groups of at most ``CHUNK`` places each."""

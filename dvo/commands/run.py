@@ -30,6 +30,7 @@ from dvo.commands.run_options import INPUTS
 from dvo.commands.scale import scale_observers, scale_settings, scaled_source
 from dvo.commands.streams import print_counts, stream_facts
 from dvo.commands.summary import Pages
+from dvo.core.allocator import without_old_garbage
 from dvo.core.errors import DvoError
 from dvo.core.settings import parse_settings, read_settings
 from dvo.data.files.output import check_place
@@ -311,7 +312,7 @@ def track(
             observer.update(frame, estimate)
         progress.update(frame, estimate)
 
-    with InterruptSwitch(getattr(clip, "stop", None)) as switch:
+    with without_old_garbage(), InterruptSwitch(getattr(clip, "stop", None)) as switch:
         with TrackingProgress(clip.frame_count) as progress:
             try:
                 done = session.run(

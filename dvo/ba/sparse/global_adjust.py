@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -37,6 +38,7 @@ from dvo.ba.sparse.schur_pattern import SchurPattern, make_schur_pattern
 from dvo.ba.sparse.small_problem import SmallProblem, is_small
 from dvo.core.context import full_precision, use_threads
 from dvo.core.errors import DvoError
+from dvo.core.kernels import use_kernels
 
 
 @dataclass(frozen=True)
@@ -215,10 +217,22 @@ class SparseProblem:
             frames = torch.arange(len(like), device=like.device)
             slots = self.parts.slots(self.state, POSES, frames) or [torch.full_like(frames, self.parts.count)]
             self.edges = _fast_edges(problem, source, slots[0], self.parts.count, options)
-        self.pattern = self._pattern(source)
-        if self.edges is not None:
-            target, anchor = (self.pattern.find(end, self.edges.plan.kk) for end in self.edges.ends)
-            self.at = target, anchor
+        if self.edges is None:
+            self.pattern = self._pattern(source)
+        else:
+            self.pattern, self.at = self._layout(self.edges, source)
+
+    def _layout(self, edges: ReprojectionEdges, source: Tensor) -> tuple[SchurPattern, tuple[Tensor, Tensor]]:
+        """Pattern, and the observations of the edges in it; without other factors made once for the same edges."""
+        key, known = (self.parts.count, edges.slot.cpu().numpy().tobytes()), edges.plan.layouts
+        if self.factors or key not in known:
+            pattern = self._pattern(source)
+            target, anchor = (pattern.find(end, edges.plan.kk) for end in edges.ends)
+            if self.factors:
+                return pattern, (target, anchor)
+            known[key] = pattern, (target, anchor)
+        layout: tuple[SchurPattern, tuple[Tensor, Tensor]] = known[key]
+        return layout
 
     def _pattern(self, source: Tensor) -> SchurPattern:
         """Where blocks are, by the elements that the factors touch now."""
@@ -245,7 +259,16 @@ class SparseProblem:
 
     def moved(self, state: State, step: tuple[Tensor, Tensor]) -> State:
         """The state after a step."""
-        return self.parts.moved(state, step)
+        poses, (turns, depths) = state[POSES], step
+        if len(state.blocks) > 2 or poses.held or not use_kernels(poses.value, turns, double=True):
+            return self.parts.moved(state, step)
+        from dvo.ba.layer.edgewise_kernels import move_poses
+
+        values, slots = poses.value[0].contiguous().numpy().copy(), np.arange(len(poses.value[0]))
+        slots = slots if poses.slot is None else poses.slot.numpy()
+        move_poses(values, np.where(slots < poses.free, PART * slots, -1), turns.contiguous().numpy().ravel())
+        found = {POSES: torch.from_numpy(values)[None], INVERSE_DEPTHS: state[INVERSE_DEPTHS].moved(depths[None]).value}
+        return state.with_values(found)
 
     def values(self, state: State) -> tuple[Tensor, Tensor]:
         """Poses ``(N, 7)`` and inverse depths ``(K,)`` of a state."""

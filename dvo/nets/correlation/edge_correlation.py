@@ -15,7 +15,9 @@ from torch import Tensor
 
 from dvo.core.kernels import use_device_kernels, use_kernels
 
-FIRST_MAPS = 8  # map slots that memory is reserved for at first
+# Map slots that memory is reserved for at first, on a CPU and on other devices. On a CPU a page takes memory once it is
+# written to: there they are as many as a window has, so that no frame waits for a copy of all maps.
+FIRST_MAPS, FIRST_ON_DEVICE = 40, 8
 _PIECE, _LARGE_PIECE = 32, 1024  # edges processed at once: in the cache of a processor; on other devices
 _SPREAD = 4  # pixels between those of a patch, up to which they share one window of the map
 
@@ -29,7 +31,7 @@ class EdgeCorrelation:
         device: of the maps.
 
     Attributes:
-        maps: ``(N, H, W, C)`` features by map slot, each in a border of ``2 radius + 2`` zeros.
+        maps: ``(N, H, W, C)`` features by map slot, each in a border of ``2 radius + 2`` zeros; others are not defined.
 
     Example:
         >>> level = EdgeCorrelation(scale=1, radius=3, device="cpu")
@@ -54,10 +56,12 @@ class EdgeCorrelation:
         c, h, w = level.shape
         have, border = len(self.maps), 2 * self.radius + 2
         if slot >= have:
-            grown = level.new_zeros(max(slot + 1, 2 * have, FIRST_MAPS), h + 2 * border, w + 2 * border, c)
+            first = FIRST_MAPS if level.device.type == "cpu" else FIRST_ON_DEVICE
+            grown = level.new_empty(max(slot + 1, 2 * have, first), h + 2 * border, w + 2 * border, c)
             if have:
                 grown[:have] = self.maps
             self.maps = grown
+        self.maps[slot].zero_()
         self.maps[slot, border : border + h, border : border + w] = level.permute(1, 2, 0)
 
     def lookup(

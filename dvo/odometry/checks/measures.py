@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+import math
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -33,7 +34,6 @@ JUMP = 6.0
 """Length of a step over the longer one of the steps before and after, and over the median, of a jump."""
 
 _Placed = tuple[CheckPair, np.ndarray, np.ndarray]
-_Pose = Callable[[int], np.ndarray | None]  # of a frame, by its number
 
 
 def measure_quality(
@@ -154,47 +154,54 @@ def _centre(pose_cw: np.ndarray) -> np.ndarray:
 
 def _shift_gain(graph: Map, placed: Sequence[_Placed], shutter: Shutter, stride: int) -> float:
     """What shifts of the images explain of the corners, see :func:`dvo.odometry.checks.floating_crop.shift_gain`."""
-    pairs, motions, pose = [], [], cache(graph.log.pose)
-    for at in looked_at([pair for pair, *_ in placed]):
-        pair, *poses = placed[at]
-        first, second = (torch.as_tensor(pose, dtype=torch.float64) for pose in poses)
-        motion = se3.relative(first, second)
-        motions.append(se3.matrix(motion).numpy())
-        pairs.append(_as_read_at_once(graph, pose, pair, motion, shutter, stride) if shutter.readout > 0 else pair)
-    return shift_gain(pairs, motions) * (ROLLING_SHARE if shutter.readout > 0 else 1.0)
+    chosen = [placed[at] for at in looked_at([pair for pair, *_ in placed])]
+    if not chosen:
+        return math.nan
+    pairs = [pair for pair, *_ in chosen]
+    poses = torch.from_numpy(np.array([ends for _, *ends in chosen], dtype=np.float64))
+    motions = se3.relative(poses[:, 0], poses[:, 1])
+    if shutter.readout > 0:
+        pairs = _as_read_at_once(graph, pairs, motions, shutter, stride)
+    return shift_gain(pairs, list(se3.matrix(motions).numpy())) * (ROLLING_SHARE if shutter.readout > 0 else 1.0)
 
 
 def _as_read_at_once(
-    graph: Map, pose: _Pose, pair: CheckPair, motion: Tensor, shutter: Shutter, stride: int
-) -> CheckPair:
-    """Corners of a pair without what a rolling shutter adds: turns, and steps as if the camera moved evenly."""
-    ends = [torch.as_tensor(part, dtype=torch.float64) for part in np.split(pair.points, 2, axis=1)]
-    focal, centre = torch.as_tensor(pair.intrinsics, dtype=torch.float64).split(2)
+    graph: Map, pairs: Sequence[CheckPair], motions: Tensor, shutter: Shutter, stride: int
+) -> list[CheckPair]:
+    """Corners of pairs without what a rolling shutter adds: turns, and steps as if the camera moved evenly."""
+    counts = [len(pair.points) for pair in pairs]
+    owner = torch.arange(len(pairs)).repeat_interleave(torch.tensor(counts))
+    ends = torch.from_numpy(np.concatenate([pair.points for pair in pairs]).astype(np.float64)).split(2, 1)
+    focal, centre = torch.from_numpy(np.stack([pair.intrinsics for pair in pairs]))[owner].split(2, 1)
 
     def turned(xy: Tensor, turn: Tensor) -> Tensor:
         rays = so3.rotate(turn, torch.cat([(xy - centre) / focal, torch.ones_like(xy[:, :1])], 1))
         return rays[:, :2] / rays[:, 2:] * focal + centre
 
     offsets = [shutter.offsets(xy[:, 1] / stride) for xy in ends]
-    numbers = pair.first, pair.second
+    numbers = torch.tensor([(pair.first, pair.second) for pair in pairs])
     first, second = (
-        turned(xy, so3.conjugate(_turn(graph, pose, number, away)))
-        for xy, number, away in zip(ends, numbers, offsets, strict=True)
+        turned(xy, so3.conjugate(_turns(graph, frames[owner], away)))
+        for xy, frames, away in zip(ends, numbers.T, offsets, strict=True)
     )
-    times = [graph.log.frames[number].timestamp for number in numbers]
-    pace = (second - turned(first, motion[3:].expand(len(first), 4))) / (times[1] - times[0])
-    corrected = [xy - pace * away[:, None] for xy, away in zip((first, second), offsets, strict=True)]
-    return replace(pair, points=torch.cat(corrected, 1).numpy())
+    times = torch.tensor([frame.timestamp for frame in graph.log.frames], dtype=torch.float64)[numbers]
+    pace = (second - turned(first, motions[owner, 3:])) / (times[:, 1] - times[:, 0])[owner, None]
+    corrected = torch.cat([xy - pace * away[:, None] for xy, away in zip((first, second), offsets, strict=True)], 1)
+    parts = corrected.split(counts)
+    return [replace(pair, points=points.numpy()) for pair, points in zip(pairs, parts, strict=True)]
 
 
-def _turn(graph: Map, pose: _Pose, number: int, offsets: Tensor) -> Tensor:
-    """Rotations ``(N, 4)`` of a camera from the time of a frame to a little earlier or later ``(N,)``, seconds."""
-    log = graph.log
-    near = [k for k in range(max(number - 2, 0), min(number + 3, len(log.frames))) if pose(k) is not None]
-    near = [k for k in near if not log.frames[k].lost and log.frames[k].segment == log.frames[number].segment]
-    times = torch.tensor([log.frames[k].timestamp for k in near], dtype=torch.float64)
-    track = PoseTrack.through(times, torch.as_tensor(np.array([pose(k) for k in near]), dtype=torch.float64))
-    return track.motion(torch.full((len(offsets),), near.index(number)), offsets)[:, 3:]
+def _turns(graph: Map, numbers: Tensor, offsets: Tensor) -> Tensor:
+    """Rotations ``(N, 4)`` of a camera from the times of frames ``(N,)`` to a little earlier or later, seconds."""
+    log, turns = graph.log, offsets.new_zeros(len(offsets), 4)
+    for segment in {log.frames[number].segment for number in numbers.unique().tolist()}:
+        poses = {k: log.pose(k) for k, frame in enumerate(log.frames) if frame.segment == segment and not frame.lost}
+        known = {k: pose for k, pose in poses.items() if pose is not None}
+        times = torch.tensor([log.frames[k].timestamp for k in known], dtype=torch.float64)
+        track = PoseTrack.through(times, torch.from_numpy(np.stack(list(known.values())).astype(np.float64)))
+        rows, mine = torch.tensor(list(known)), torch.isin(numbers, torch.tensor(list(known)))
+        turns[mine] = track.motion(torch.searchsorted(rows, numbers[mine]), offsets[mine])[:, 3:]
+    return turns
 
 
 def count_jumps(result: Result) -> int:

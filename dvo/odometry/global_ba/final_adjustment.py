@@ -83,6 +83,7 @@ class AdjustmentOptions:
 _MOTION_ITERATIONS = 5  # of a solution that the motion during the readout is taken from, at most
 _MOST = 1.5  # change of an inverse depth that is extrapolated
 _RESTART_ITERATIONS = 20  # of the first frames from each start, at most
+_LOOK_FRAMES = 20  # of the first frames that tell if another start may be better
 
 
 @dataclass(frozen=True)
@@ -171,7 +172,8 @@ def adjust_segment(
         if first:
             poses, found, _ = solve_part(part, poses, found, fixed, replace(options, kernels=first))
         if start == 1 and not map_size and measured_share(measured_depths(part)) < MEASURED_SHARE:
-            poses, found = _leave_minimum(part, poses, found, fixed, options)
+            kept = torch.tensor([graph.archive[int(k)].anchor is None for k in part.identifiers])
+            poses, found = _leave_minimum(part, poses, found, fixed, kept, options)
         rounds = options.shutter_rounds if rolling is not None else 0
         for number in range(rounds):
             assert rolling is not None
@@ -194,12 +196,13 @@ def adjust_segment(
 
 
 def _leave_minimum(
-    part: PatchProblem, poses_cw: Tensor, depths: Tensor, fixed: Tensor, options: AdjustmentOptions
+    part: PatchProblem, poses_cw: Tensor, depths: Tensor, fixed: Tensor, kept: Tensor, options: AdjustmentOptions
 ) -> tuple[Tensor, Tensor]:
     """Start the first block anew if that is better for its first frames; see :mod:`dvo.ba.multistart`.
 
     Args:
         part, poses_cw, depths, fixed: block with its solution.
+        kept: ``(N,)`` bool, keyframes that were not dropped.
         options: kernels and iterations.
 
     Returns:
@@ -208,12 +211,17 @@ def _leave_minimum(
     n, m = min(options.restart_frames, len(depths)), depths.shape[1]
     whole = part.with_values(poses_cw=poses_cw, inverse_depths=depths.flatten())
     first = torch.arange(len(poses_cw)) < n
-    # Half of the patches tell two solutions apart as well, and measured depths have no part in it.
-    early = whole.with_values(factors=()).edges(part.kk % 2 == 0).select(first)
-    if not len(early.kk):
-        return poses_cw, depths
     solver = LMOptions(max_iterations=_RESTART_ITERATIONS, tolerance=options.tolerance)
     settings = GlobalBAOptions(fixed[:n], options.kernels[-1], options.max_residual, solver=solver)
+    # Half of the patches tell two solutions apart as well, and measured depths have no part in it.
+    half = whole.with_values(factors=()).edges(part.kk % 2 == 0)
+    # Few frames are solved for in a fraction of the time; only if they prefer another start, all of them are.
+    few = torch.zeros_like(first)
+    few[:n] = thinned(kept[:n], _LOOK_FRAMES)
+    look = half.select(few)
+    if not len(look.kk) or preferred(multistart(look, RESTARTS, replace(settings, fixed=fixed[few]))).start == PRESENT:
+        return poses_cw, depths
+    early = half.select(first)
     better = preferred(multistart(early, RESTARTS, settings))
     if better.start == PRESENT:
         return poses_cw, depths
@@ -233,6 +241,24 @@ def _leave_minimum(
     settings = replace(settings, fixed=fixed, solver=replace(solver, max_iterations=3 * options.iterations))
     found = multistart(whole, {PRESENT: present, "extended": extended, better.start: restarted}, settings)[0].problem
     return found.poses_cw, found.inverse_depths.reshape_as(depths)
+
+
+def thinned(kept: Tensor, count: int) -> Tensor:
+    """Choose frames of a problem: those that are kept and others, or some of those that are kept, evenly.
+
+    Args:
+        kept: ``(N,)`` bool.
+        count: of the frames that are chosen, if there are as many.
+
+    Returns:
+        ``(N,)`` bool.
+    """
+    missing = count - int(kept.sum())
+    chosen, among = (kept.clone(), ~kept) if missing >= 0 else (torch.zeros_like(kept), kept)
+    others = among.nonzero()[:, 0]
+    number = min(missing if missing >= 0 else count, len(others))
+    chosen[others[torch.linspace(0, len(others) - 1, number).round().long()]] = True
+    return chosen
 
 
 def extend_solution(poses_cw: Tensor, depths: Tensor, first_cw: Tensor, solved: Tensor) -> tuple[Tensor, Tensor]:

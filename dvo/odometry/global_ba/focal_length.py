@@ -21,7 +21,7 @@ from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3
 from dvo.map.map import Map
 from dvo.map.recordings import increasing_times
-from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, extrapolated, solve_part
+from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, extrapolated, solve_part, thinned
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.global_ba.self_calibration import Minimum, profile_minimum
 
@@ -35,7 +35,7 @@ ASIDE = 0.08
 MIN_CONTRAST = 0.005
 """Contrast of the coarse minimum below which no finer one is looked for."""
 
-QUICK_FRAMES = 60
+QUICK_FRAMES = 40
 """Frames of a quick look, if there are fewer keyframes."""
 
 _STEPS = 0.08, 0.02  # distance of the values that are tried, in logarithms: coarse, then fine
@@ -81,8 +81,8 @@ def find_focal(
         shutter: timing of the rows; a rolling shutter that is not corrected is taken for another focal length.
         options: of the adjustment; its last kernel counts.
         beyond: logarithm of a factor; a profile whose minimum is nearer to the first value is of no interest. This is a
-            quick look, without the principal point: at the keyframes, with dropped ones up to :data:`QUICK_FRAMES`, and
-            with measurements that are corrected for a rolling shutter once.
+            quick look, without the principal point: at half of the patches of the keyframes, with dropped ones up to
+            :data:`QUICK_FRAMES`, and with measurements that are corrected for a rolling shutter once.
 
     Returns:
         The profile; that of the coarse steps alone where it is flat (:data:`MIN_CONTRAST`), or of no interest, then
@@ -95,7 +95,10 @@ def find_focal(
     part, times = graph.problem(True, segment), increasing_times(graph, frames)
     if beyond is not None:
         part, shutter = _corrected(part, times, shutter), replace(shutter, readout=0.0)
-        part = _thinned(part, torch.tensor([frame.anchor is None for frame in frames]))
+        kept = torch.tensor([frame.anchor is None for frame in frames])
+        if not part.factors:
+            part = part.select(thinned(kept, max(QUICK_FRAMES, int(kept.sum()))))
+        part = part.edges(part.kk % 2 == 0)
     solve = _Solver(
         part.planned(), times, shutter,
         replace(options, kernels=options.kernels[-1:], iterations=_ITERATIONS),
@@ -138,18 +141,6 @@ def _corrected(part: PatchProblem, times: Tensor, shutter: Shutter) -> PatchProb
     index, track = torch.arange(len(part.poses_cw)), PoseTrack.through(times, part.poses_cw)
     depths = part.inverse_depths.reshape(len(index), -1)
     return as_global_shutter(part, part.poses_cw, depths, index, track, shutter)
-
-
-def _thinned(part: PatchProblem, kept: Tensor) -> PatchProblem:
-    """The frames that are kept ``(N,)``, and others, evenly, up to :data:`QUICK_FRAMES`."""
-    others = (~kept).nonzero()[:, 0]
-    missing = min(QUICK_FRAMES - int(kept.sum()), len(others))
-    if part.factors or missing == len(others):
-        return part
-    chosen = kept.clone()
-    if missing > 0:
-        chosen[others[torch.linspace(0, len(others) - 1, missing).round().long()]] = True
-    return part.select(chosen)
 
 
 def _along(first: tuple[float, ...], second: tuple[float, ...], third: tuple[float, ...]) -> float | None:

@@ -105,7 +105,8 @@ def find_readout(
     own = [np.median(frame.inverse_depth) for frame in frames[earlier:]]
     first = earlier + _busiest(now[earlier:], float(np.median(own)))
     last = min(first + _FRAMES, len(frames)) - 1
-    part = graph.problem(True, segment, int(identifiers[first]) if first else 0, int(identifiers[last])).planned()
+    part = graph.problem(True, segment, int(identifiers[first]) if first else 0, int(identifiers[last]))
+    part = part.edges(part.kk % 2 == 0).planned()  # half of the patches tell it as well
     index = torch.from_numpy(np.searchsorted(identifiers, part.identifiers.numpy()))
     fixed = index <= first
     depths = part.patches[:, 2, 0, 0].reshape(len(index), -1)
@@ -132,7 +133,7 @@ def find_readout(
         return found
 
     interval = float((times[1:] - times[:-1])[earlier:].median())
-    return profile_minimum(cost, 0.0, _STEP * interval, 0.0, _MAX_READOUT * interval, depths.numel())
+    return profile_minimum(cost, 0.0, _STEP * interval, 0.0, _MAX_READOUT * interval, depths.numel() // 2)
 
 
 def adjust_segments(

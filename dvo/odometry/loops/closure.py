@@ -109,7 +109,7 @@ class LoopCloser:
         self.pending = None
 
     def advance(self, segments: Collection[int], at_once: bool = False) -> bool:
-        """Look at the keyframes that have been archived since the last call, once a frame.
+        """Look at the keyframes that have been archived since the last call, once a frame at most.
 
         Args:
             segments: those that are initialised. Keyframes of others wait until theirs is.

@@ -29,7 +29,8 @@ class Job(Generic[T]):
         kind: of the work.
         task: gives its result: beside tracking, or in steps, some of which each frame takes.
         apply: called once with the result, between two frames.
-        left: frames that the network measures until the result is taken; a job in steps ends with the last of them.
+        left: calls of :meth:`MapMaintenance.advance` until the result is taken: frames that the network measures, and
+            every few that are aligned; a job in steps ends with the last of them.
     """
 
     kind: Kind
@@ -116,7 +117,7 @@ class MapMaintenance:
         return self._background.start if self.job is None and core_free() else None
 
     def advance(self, owner: Owner, at_once: bool = False) -> bool:
-        """Take the result of the job in progress if its time has come, and begin the next one; once a frame.
+        """Take the result of the job in progress if its time has come, and begin the next one; once a frame at most.
 
         Args:
             owner: of the map.

@@ -105,7 +105,7 @@ class TrackerConfig:
         restart: start the window anew, some frames after the initialisation, and the final adjustment, if that leads to
             a better solution (:mod:`dvo.ba.multistart`).
         initial_frames: keyframes before the first joint optimisation.
-        initial_updates, final_updates: updates at initialisation and in ``finish``.
+        initial_updates, final_updates: updates at initialisation, at most, and in ``finish``.
         updates: updates of each frame.
         initial_motion: median revision of the flow, in feature pixels, above which a frame becomes a keyframe before
             initialisation.
@@ -156,7 +156,7 @@ class TrackerConfig:
     optimisation: int = 8
     initial_frames: int = 5
     initial_updates: int = 16
-    final_updates: int = 8
+    final_updates: int = 2
     final_adjustment: bool = True
     estimate_readout: bool = True
     loops: bool = True

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
+from torch import Tensor
+
 from dvo.ba.multistart import (
     AS_THEY_ARE,
     COLD_STARTS,
@@ -13,7 +17,8 @@ from dvo.ba.multistart import (
     preferred,
     present,
 )
-from dvo.ba.options import damping_at
+from dvo.ba.options import COLD_UPDATES, damping_at
+from dvo.geometry.projection import reproject
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.window import Window
 from dvo.models.step import Revision
@@ -22,7 +27,7 @@ from dvo.odometry.frames.content import NO_MATCH
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.uncertainty.uncertainty import has_second_solution
 from dvo.odometry.window.patch_window import PatchWindow
-from dvo.odometry.window.pose_validation import last_unrelated, measured, parallax
+from dvo.odometry.window.pose_validation import CONFIDENT, last_unrelated, measured, parallax
 
 MOVED_SHARE = 0.2
 """Share of the patches that have to move: the others may be far away, or fixed to the camera."""
@@ -30,6 +35,9 @@ SLOW_START = (0.3, 0.6)
 """Shares of the motion and of the parallax that a slow start needs."""
 SLOW_AFTER = (4, 10)
 """Frames without a start between which what is needed goes down to :data:`SLOW_START`."""
+SETTLED, CALM = 0.02, 2
+"""Motion of nine tenths of the reprojections in an update, feature pixels, below which a first window has settled, and
+updates in a row that say so. The updates that are left out would move them by less than 0.08 in all."""
 NOT_INITIALISED = "not initialised: too little motion"
 """Cause of the loss of the frames of a segment that was never initialised."""
 
@@ -98,11 +106,11 @@ def first_motion(revision: Revision, window: Window, config: TrackerConfig, wait
 
 
 def initialise(patch_window: PatchWindow, config: TrackerConfig, waited: int, beside: Beside | None = None) -> bool:
-    """Optimise the first window.
+    """Optimise the first window until it has settled.
 
-    After half of the updates the window is also solved from identity poses with the current flow, and the better of the
-    solutions is kept (:data:`dvo.ba.multistart.COLD_STARTS`). With measured depths of most patches there is
-    no other solution to look for, and no parallax is needed.
+    When it has, or after half of the updates, the window is also solved from identity poses with the current flow, and
+    the better of the solutions is kept (:data:`dvo.ba.multistart.COLD_STARTS`). With measured depths of most patches
+    there is no other solution to look for, and no parallax is needed.
 
     Args:
         patch_window: the first keyframes; changed in place.
@@ -115,11 +123,18 @@ def initialise(patch_window: PatchWindow, config: TrackerConfig, waited: int, be
     """
     window = patch_window.window
     measured = measured_share(window.measured) >= MEASURED_SHARE
+    calm, tried, places = 0, measured, _reprojections(window)
     for age in range(config.initial_updates):
         patch_window.step(1, damping_at(age))
-        if age == config.initial_updates // 2 and not measured:
-            _solve_again(patch_window, beside)
+        before, places = places, _reprojections(window)
+        calm = calm + 1 if age >= COLD_UPDATES and _moved(window, before, places) < SETTLED else 0
+        if not tried and (calm == CALM or age == config.initial_updates // 2):
+            tried = True
+            if _solve_again(patch_window, beside):
+                calm, places = 0, _reprojections(window)
             match_window(window)
+        if tried and calm >= CALM:
+            break
     n = len(window)
     if measured:
         return True
@@ -129,14 +144,27 @@ def initialise(patch_window: PatchWindow, config: TrackerConfig, waited: int, be
     return seen >= needed(waited)[1] * config.initial_parallax
 
 
-def _solve_again(patch_window: PatchWindow, beside: Beside | None) -> None:
-    """Replace poses and depths by a solution from one pose for all frames, if it suits the current flow better."""
-    window, revision = patch_window.window, patch_window.revise()
-    problem = window.problem().with_values(targets=revision.targets[0], weights=revision.weights[0])
+def _reprojections(window: Window) -> Tensor:
+    """Where the centres of the patches of the edges are seen ``(E, 2)``, feature pixels."""
+    middle = window.patches.shape[-1] // 2
+    values = window.poses_cw[None], window.patches[None], window.intrinsics[None], window.ii, window.jj, window.kk
+    return reproject(*values).coords[0, :, middle, middle]
+
+
+def _moved(window: Window, before: Tensor, after: Tensor) -> float:
+    """Motion of nine tenths of the reprojections ``(E, 2)`` of confident measurements, feature pixels."""
+    sure = window.confidence.mean(-1) > CONFIDENT
+    return float((after - before)[sure].norm(dim=-1).quantile(0.9)) if bool(sure.any()) else math.inf
+
+
+def _solve_again(patch_window: PatchWindow, beside: Beside | None) -> bool:
+    """Replace poses and depths by a solution from one pose for all frames if it suits the flow better; if they were."""
+    window = patch_window.window
     # Not solved further: a narrow kernel would fit the first, coarse flow.
-    best = preferred(multistart(problem, {PRESENT: present, **COLD_STARTS}, AS_THEY_ARE, beside=beside))
+    best = preferred(multistart(window.problem(), {PRESENT: present, **COLD_STARTS}, AS_THEY_ARE, beside=beside))
     if best.start != PRESENT:
         _take(window, best)
+    return best.start != PRESENT
 
 
 def _take(window: Window, solution: Solution) -> None:

@@ -57,6 +57,9 @@ from dvo.odometry.window.sensors import WINDOW_SENSORS, WindowSensor
 
 LOOK_EVERY = 3
 """Aligned frames in a row, of which one is looked at for pixels that are fixed to the images."""
+JOBS_EVERY = 4
+"""Aligned frames in a row after which the jobs beside tracking advance as after a frame that the network measures: they
+take about as long."""
 BEGINNING, MOST_HELD = 64, 0.02
 """Frames within which a recording begins anew where more than this share of the image is found to be fixed to it: what
 was measured there holds poses and scale of the frames before."""
@@ -233,6 +236,8 @@ class PatchOdometry:
         state.guess = None
         if self.aligner is None or state.phase is not Phase.TRACKING or window.guests or admitted.gap:
             return None
+        if self.aligner.age and self.aligner.age % JOBS_EVERY == 0:
+            self.loops.advance(state.adjustable)  # may correct the window
         image, camera = admitted.image, admitted.camera.intrinsics
         found = self.aligner.align(image, camera, mask, record.timestamp)
         if found is None:

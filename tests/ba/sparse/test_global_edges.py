@@ -96,3 +96,28 @@ def test_gradients_and_other_types_are_for_the_twin():
     assert edges._compiled(*values) == available()
     assert not edges._compiled(values[0].clone().requires_grad_(), values[1])
     assert not replace(edges, weight=edges.weight.float())._compiled(*values)
+
+
+@pytest.mark.long
+@settings(max_examples=60, deadline=None)
+@given(**GRAPHS)
+def test_poses_and_depths_move_as_by_the_twin(seed, frames, per_frame, edges, kernel, double, held):
+    problem = graph(seed, frames, per_frame, edges, torch.float64 if double else torch.float32)
+    sparse = SparseProblem(problem, GlobalBAOptions([bool(held >> k & 1) for k in range(frames)], kernel, 16.0))
+    g = torch.Generator().manual_seed(seed)
+    step = torch.randn(sparse.parts.count, 6, generator=g), torch.randn(len(problem.patches), generator=g)
+    found, wanted = both(lambda: sparse.values(sparse.moved(sparse.state, tuple(x.to(problem.poses_cw) for x in step))))
+    for one, twin in zip(found, wanted, strict=True):
+        close(one, twin, 1e-11 if double else 2e-4)
+
+
+def test_solutions_of_one_plan_share_what_does_not_change():
+    problem = graph(4, MOST_FRAMES + 1, 10, 1500)
+    problem = problem.with_values(targets=torch.where(problem.targets.isfinite(), problem.targets, 0.0))
+    planned = problem.planned()
+    for fixed in (1, 3, 1):
+        options = GlobalBAOptions(fixed, Kernel("huber", 0.5), 64.0, solver=LMOptions(max_iterations=3))
+        assert torch.equal(adjust_sparse(planned, options).poses_cw, adjust_sparse(problem, options).poses_cw)
+    assert planned.plan is not None and len(planned.plan.layouts) == 2
+    first, second = (SparseProblem(planned, options) for _ in range(2))
+    assert first.pattern is second.pattern

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dvo
@@ -12,7 +12,13 @@ from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.map.archive import ArchiveConfig
 from dvo.metrics import evaluate
-from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, adjust_segment, extend_solution, extrapolated
+from dvo.odometry.global_ba.final_adjustment import (
+    AdjustmentOptions,
+    adjust_segment,
+    extend_solution,
+    extrapolated,
+    thinned,
+)
 from dvo.session.session import run
 from dvo.synth.sequence import make_sequence
 from tests.support.archived_walk import archived_walk
@@ -51,12 +57,12 @@ def test_frames_whose_measurements_are_released_stay_and_hold_the_scale():
 
 def test_a_reversed_relief_is_left():
     """Frames of a short baseline that were tracked with the second solution get the first one."""
-    for restart_frames, exact in ((0, False), (60, True), (3, True)):
-        graph, truth = archived_walk(frames=6, interval=0.03)
+    for restart_frames, frames, exact in ((0, 6, False), (60, 6, True), (3, 6, True), (60, 30, True)):
+        graph, truth = archived_walk(frames=frames, interval=0.18 / frames)
         part = graph.problem(True, 0)
         (wrong,) = multistart(part, {"reversed": reversed_relief})
         poses, patches = wrong.problem.poses_cw, wrong.problem.patches
-        for i in range(6):
+        for i in range(frames):
             graph.correct(i, poses[i].numpy(), patches[8 * i : 8 * i + 8, 2, 0, 0].numpy())
         adjust_segment(graph, 0, AdjustmentOptions(restart_frames=restart_frames, iterations=30))
         found = evaluate(graph.log.trajectory(), truth)
@@ -133,3 +139,12 @@ def test_solutions_along_a_line_are_extrapolated_exactly(seed, ratio):
     wanted, wanted_depths = at(1.0 + ratio)
     assert se3.log(se3.relative(poses, wanted)).abs().max() < 1e-9
     torch.testing.assert_close(found, wanted_depths, atol=1e-9, rtol=1e-9)
+
+
+@settings(max_examples=40)
+@given(st.lists(st.booleans(), max_size=70), st.integers(1, 30))
+def test_frames_are_thinned_to_a_number(kept, count):
+    kept = torch.tensor(kept, dtype=torch.bool)
+    chosen = thinned(kept, count)
+    assert int(chosen.sum()) == min(count, len(kept))
+    assert bool(chosen[kept].all() if int(kept.sum()) <= count else ~chosen[~kept].any())

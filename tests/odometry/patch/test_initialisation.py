@@ -2,15 +2,17 @@
 
 from types import SimpleNamespace
 
+import pytest
 import torch
 
 from dvo.ba.kernels import Kernel
 from dvo.ba.multistart import multistart, reversed_relief
+from dvo.ba.options import COLD_UPDATES
 from dvo.geometry import se3
 from dvo.odometry.depth.depth_factor import MEASURED_SHARE, measured_share
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.patch.config import TrackerConfig
-from dvo.odometry.patch.initialisation import leave_minimum
+from dvo.odometry.patch.initialisation import CALM, initialise, leave_minimum
 from dvo.odometry.patch.state import RESTART_AGES, TrackerState
 from dvo.odometry.window.patch_window import StepSettings
 from tests.support.archived_walk import archived_walk, pose_at
@@ -76,3 +78,24 @@ def test_settings_turn_kernel_and_restart_off():
     assert config.kernel == Kernel("none") and config.adjustment.restart_frames == 0
     assert TrackerConfig(robust=0.2).kernel == Kernel("cauchy", 0.2)
     assert TrackerConfig().adjustment == AdjustmentOptions()
+
+
+@pytest.mark.parametrize("unit", [0.0, 1.0])
+@pytest.mark.parametrize("moving", [0, 6, 100])
+def test_a_first_window_is_updated_until_it_has_settled(moving, unit):
+    """A walk whose exact solution is shaken by the first updates."""
+    graph, _ = archived_walk(frames=6, wrong=0.1, archived=False, unit=unit)
+    window, updates = graph.window, []
+    right = pose_at(0.1 * torch.arange(6, dtype=torch.float64)).float()
+    window.confidence = window.weights
+
+    def step(fixed, damping):
+        updates.append(damping)
+        shake = torch.zeros(6, 6)
+        shake[1:, 4] = 0.01 * (len(updates) % 2) * (len(updates) <= moving)
+        window.poses_cw = se3.compose(se3.exp(shake), right)
+
+    config = TrackerConfig()
+    initialise(SimpleNamespace(window=window, step=step), config, 6)
+    settled = max(COLD_UPDATES, moving) + CALM
+    assert len(updates) == min(settled, config.initial_updates)

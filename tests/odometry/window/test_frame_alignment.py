@@ -17,6 +17,7 @@ from dvo.geometry import se3
 from dvo.geometry.poses import se3_exp
 from dvo.metrics import evaluate
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, adjust_segment
+from dvo.odometry.patch.tracker import JOBS_EVERY
 from dvo.odometry.protocol import Estimate, Status
 from dvo.odometry.window.frame_alignment import noise, solve_pose, solve_pose_plain
 from dvo.synth.sequence import make_sequence
@@ -216,3 +217,24 @@ def test_the_pose_is_exact_with_a_third_of_wrong_positions():
     measured[:20] += random.uniform(20, 60, (20, 2))
     found = solve_pose(points, measured, np.ones((60, 2)), CAMERA, np.eye(4), (4.0, 1.0, 0.3, 0.3))
     assert np.abs(found[:3, 3] - translation).max() < 1e-4 and np.abs(found[:3, :3] - rotation).max() < 1e-4
+
+
+def test_jobs_advance_beside_aligned_frames_too():
+    frames, _ = film(40, speed=0.15)
+    odometry, taken, due, longest = dvo.load("small", **FEW), [], 0, 0
+
+    def steps():
+        while True:
+            taken.append(None)
+            yield
+
+    for frame in frames:
+        maintenance = odometry.loops.maintenance
+        if maintenance.job is None and odometry.state.initialised:
+            maintenance.job = maintenance.in_steps("search", steps(), lambda _: None)
+        age, busy = odometry.aligner.age, maintenance.job is not None
+        odometry.track(frame)
+        measured = odometry.aligner.age == 0
+        due += busy * (measured + (age > 0 and age % JOBS_EVERY == 0))
+        longest = max(longest, odometry.aligner.age)
+    assert longest > JOBS_EVERY and len(taken) == due > 0

@@ -64,6 +64,9 @@ FOUND_EXTRINSIC = 0.02
 """Deviation of a rotation between sensor and camera that was found from the motion, rad."""
 NOISE_RANGE = (0.3, 30.0)
 """Factors of the noise of visual poses."""
+MAX_FORCE_SIGMA = 0.025
+"""Deviation of the acceleration, m/s^2, by bias and vertical together, above which samples hold a velocity no better
+than images do, and are no measurement for the window."""
 MAX_ROTATION_FACTOR = 8.0
 """Factor of the noise of visual orientations above which samples and images do not fit."""
 MAX_SHIFT = 0.02
@@ -188,6 +191,12 @@ class InertialEstimator:
         """True if poses are in metres."""
         return self.state in (ScaleState.ALIGNED, ScaleState.REFINED)
 
+    @property
+    def leads(self) -> bool:
+        """True if samples tell the acceleration well enough to be a measurement for the window."""
+        s = self.solution
+        return self.aligned and s is not None and float(s.force_variance.mean()) <= MAX_FORCE_SIGMA**2
+
     def add(self, samples: InertialSamples) -> None:
         """Take samples; the first with an extrinsic calibration and noise decide these.
 
@@ -249,7 +258,7 @@ class InertialEstimator:
         if found is None:
             self._refuse("the motion does not tell scale and gravity", time)
             return
-        self._adapt(found)
+        self._adapt(found, led=self.leads)
         reason = self._doubt(problem, found)
         if not reason and worlds[-1] in self.worlds and found.scale_sigma > LOST_SCALE:
             reason = f"the scale is uncertain by {100 * found.scale_sigma:.0f} %"
@@ -698,9 +707,9 @@ class InertialEstimator:
                 f"gyroscope and images turn differently, by {angle:.1f} degrees: axes, time offset or clock"
             )
 
-    def _adapt(self, found: Smoothed) -> None:
-        """Follow the noise of the visual poses."""
-        factors = np.clip(np.sqrt(found.visual_error), 0.7, 1.4)
+    def _adapt(self, found: Smoothed, *, led: bool = False) -> None:
+        """Follow the noise of the visual poses; those that samples lead agree with them, whatever the noise is."""
+        factors = np.clip(np.sqrt(found.visual_error), 1.0 if led else 0.7, 1.4)
         known = self._smoother
         now = np.array([known.rotation_factor, known.position_factor, known.scale_factor])
         rotation, position, scale = np.clip(now * factors, *NOISE_RANGE).tolist()

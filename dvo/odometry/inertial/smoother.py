@@ -195,6 +195,16 @@ class Smoothed:
         turned = self.rotation[-1] @ self.covariance[:3, :3] @ self.rotation[-1].T
         return float(np.rad2deg(np.sqrt(turned[0, 0] + turned[1, 1])))
 
+    @property
+    def force_variance(self) -> Array:
+        """``(3,)`` variances of the acceleration at the newest node, in the axes of the sensor, (m/s^2)^2.
+
+        What is not known of the vertical acts as a bias of the accelerometer.
+        """
+        by = np.zeros((3, len(self.covariance)))
+        by[:, 12:STATE], by[:, :3] = np.eye(3), -skew(self.rotation[-1].T @ GRAVITY)
+        return ((by @ self.covariance) * by).sum(1)
+
 
 @dataclass
 class Values:

@@ -83,6 +83,8 @@ _WAITING = ("too few poses", "too few samples")
 SURE_OFFSET, SURE_TURN = 3e-3, 0.5
 """Deviation of the time offset, seconds, and of rotations over a third of a second, degrees, of a gyroscope that tells
 the rotation within a readout."""
+HELD = 0.05
+"""Seconds for which the newest sample is held."""
 LONGEST_GAP = 0.02
 """Between samples that tell a rotation within a readout, seconds."""
 STILL = (0.02, 0.15)
@@ -423,6 +425,26 @@ class InertialEstimator:
         if not motion.covered.all():
             return None
         return turn @ motion.rotation[0] @ turn.T
+
+    def turns_about(self, time: float, offsets: Array) -> Array | None:
+        """Orientations of the camera about the time of a frame by the gyroscope, whose newest sample is held.
+
+        Args:
+            time: of the frame, seconds, clock of the camera.
+            offsets: ``(S,)`` seconds relative to it, some hundredths at most.
+
+        Returns:
+            ``(S, 3)`` rotation vectors from the orientation at the time to those at the offsets, in the axes of the
+            camera, rad; None without samples, or if the rotation between sensor and camera is not known.
+        """
+        turn, bias = self.rotation_camera_imu, np.zeros(3) if self.solution is None else self.solution.gyro_bias[-1]
+        time += self.first_offset if self.solution is None else self.solution.time_offset
+        near = self.stream.near(time - HELD, time + HELD)
+        if turn is None or near is None or near.timestamps[0] > time:
+            return None
+        columns = [np.interp(np.append(time + offsets, time), near.timestamps, axis) for axis in near.gyro.T]
+        rates = np.stack(columns, -1) - bias
+        return 0.5 * (rates[:-1] + rates[-1]) * offsets[:, None] @ turn.T
 
     def turns(self, nodes: VisualNodes) -> Callable[[Array, Array], Array] | None:
         """What the gyroscope tells of rotations about the times of frames, also without an alignment.
@@ -860,10 +882,19 @@ def _words(reason: str) -> str:
     return "".join(letter for letter in reason if not letter.isdigit())
 
 
+def _held(samples: InertialSamples, until: float) -> InertialSamples:
+    """Samples of which the newest is held until a time soon after it, as where the sensor's clock is ahead."""
+    stamps = samples.timestamps
+    if not len(samples) or not 0 < until - stamps[-1] < HELD:
+        return samples
+    gyro, accel = (np.concatenate([values, values[-1:]]) for values in (samples.gyro, samples.accel))
+    return replace(samples, timestamps=np.append(stamps, until), gyro=gyro, accel=accel)
+
+
 def _step(state: BodyState, time: float, offset: float, samples: InertialSamples, noise: ImuNoise) -> BodyState:
     """State at a later time."""
     times = np.array([state.time, time]) + offset
-    near = samples.between(times[0] - 0.5, times[1] + 0.5)
+    near = _held(samples.between(times[0] - 0.5, times[1] + 0.5), times[1])
     if len(near) < 2:
         return state
     moved = propagate(

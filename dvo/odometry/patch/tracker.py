@@ -177,8 +177,11 @@ class PatchOdometry:
     def _process(self, admitted: Admitted) -> Estimate:
         """Process a frame that has passed the gate."""
         state = self.state
-        state.shutter = Shutter(admitted.camera.readout, admitted.camera.height / self.model.config.STRIDE)
         record = self.graph.log.add(admitted.timestamp)
+        if not (admitted.repeated or admitted.problem):
+            admitted = self.inertial.read_at_once(admitted)
+        readout = 0.0 if self.inertial.corrects_shutter else admitted.camera.readout
+        state.shutter = Shutter(readout, admitted.camera.height / self.model.config.STRIDE)
         if admitted.repeated:
             estimate = self._repeat(record)
         else:
@@ -266,7 +269,9 @@ class PatchOdometry:
             self._close_segment()
             self.loops.complete(state.adjustable)
             state.shutter = replace(state.shutter, turns=self.inertial.turns())
-            state.info |= finish_segments(self.graph, state, self.config, self.loops)
+            estimate = self.config.estimate_readout and not self.inertial.corrects_shutter
+            config = replace(self.config, estimate_readout=estimate)
+            state.info |= finish_segments(self.graph, state, config, self.loops)
             state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
             state.info |= self.inertial.settle(self.loops)
         return replace(self._result({}), quality=state.quality)

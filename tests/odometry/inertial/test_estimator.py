@@ -14,7 +14,7 @@ from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.smoother import GRAVITY, Similarities, VisualNodes, first_values, smooth, upright
 from dvo.odometry.inertial.stream import SampleStream
 from dvo.odometry.protocol import ScaleState
-from tests.support.visual_inertial import CAMERA_IMU, LEVER, SCALE, Recording, record
+from tests.support.visual_inertial import CAMERA_IMU, LEVER, OFFSET, SCALE, Recording, record
 
 
 def feed(estimator: InertialEstimator, recording: Recording, time: float) -> None:
@@ -464,3 +464,33 @@ def test_a_time_within_a_gap_of_the_samples_has_none_near_it():
     assert stream.near(1.9, 2.1) is None
     near = stream.near(0.9, 3.1)
     assert near is not None and len(near) == np.sum((times > 0.9) & (times <= 3.1))
+
+
+def test_orientations_about_a_frame_are_those_of_the_samples_and_hold_the_newest() -> None:
+    recording = record(7, seconds=4.0)
+    estimator, time, offsets = InertialEstimator(InertialOptions()), 2.0, np.array([-0.01, 0.0, 0.01])
+    estimator.add(recording.samples.between(0.0, 3.0))
+    turns, later = (estimator.turns_about(at, offsets) for at in (time, 3.0))
+    assert turns is not None and later is not None and not turns[1].any()
+    expected = estimator.turn_between(time, time + 0.01)
+    assert expected is not None and np.linalg.norm(rotation_vector(expected)) > 1e-3
+    np.testing.assert_allclose(so3_exp(turns[2]), expected, atol=1e-4)
+    before, after = later[[0, 2]]
+    assert np.linalg.norm(before + after) < 0.3 * np.linalg.norm(after)
+    assert estimator.turns_about(3.1, offsets) is None
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.012, 0.02, 0.03])
+def test_a_state_soon_after_the_newest_sample_is_as_sure_as_in_a_gap(offset: float) -> None:
+    """Where the sensor's clock is ahead, the newest frame is later than the samples that have come with it."""
+    recording = record(6, seconds=3.0)
+    rotation, position, velocity = (part[20] for part in recording.body)
+    time, zero = float(recording.times[20]), np.zeros(3)
+    estimator = InertialEstimator(InertialOptions())
+    estimator.add(recording.samples.between(0.0, time + 0.1 + OFFSET - offset))
+    estimator.solution = _Solution()  # type: ignore[assignment]
+    start = BodyState(time + OFFSET, rotation, position, velocity, zero, zero, 1e-6 * np.eye(15))
+    state = estimator.predict(start, np.array([time + 0.1 + OFFSET]))[0]
+    sigma = np.sqrt(np.trace(state.covariance[6:9, 6:9]))
+    assert np.linalg.norm(state.velocity - recording.body[2][22]) < 4 * sigma
+    assert sigma < 0.25

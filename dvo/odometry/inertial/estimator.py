@@ -16,7 +16,7 @@ import numpy as np
 from dvo.data.inertial import NOISE_PRESETS, ImuNoise, InertialSamples
 from dvo.geometry.poses import rotation_vector, skew, so3_exp, split
 from dvo.odometry.inertial.options import InertialOptions
-from dvo.odometry.inertial.preintegration import preintegrate, propagate
+from dvo.odometry.inertial.preintegration import integrated_turn, preintegrate, propagate
 from dvo.odometry.inertial.smoother import (
     GRAVITY,
     NODE,
@@ -219,17 +219,23 @@ class InertialEstimator:
             rotation, translation = split(np.asarray(samples.T_camera_imu, float))
             self.rotation_camera_imu, self.translation_camera_imu = rotation, translation
 
-    def refresh(self, time: float, nodes: Callable[[float], tuple[VisualNodes, list[int]]]) -> None:
+    def refresh(
+        self, time: float, nodes: Callable[[float], tuple[VisualNodes, list[int]]], *, moved: bool = True
+    ) -> None:
         """Make the next estimate if it is due: of the whole window, or one that goes on from it.
 
         Args:
             time: of the newest frame, seconds.
             nodes: gives the visual poses from a time on, and the world of each of their segments.
+            moved: since the last estimate by more than a little; otherwise that of the whole window is waited for.
         """
         if self.state is ScaleState.NONE or time < self._next:
             return
         past = self.solution.past if self.solution is not None and self.aligned else None
-        if past is None or time > self._whole + EVERY - 1e-6 or not self._go_on(past, *nodes(past.time)):
+        whole = past is None or time > self._whole + EVERY - 1e-6
+        if past is not None and not whole and moved:
+            whole = not self._go_on(past, *nodes(past.time))
+        if whole:
             self.update(*nodes(time - self.options.window))
 
     def update(self, nodes: VisualNodes, worlds: list[int]) -> None:
@@ -421,10 +427,8 @@ class InertialEstimator:
         near = self.stream.near(times[0] - 0.1, times[1] + 0.1)
         if near is None or len(near) < 2:
             return None
-        motion = preintegrate(near, times, bias, np.zeros(3), self.noise)
-        if not motion.covered.all():
-            return None
-        return turn @ motion.rotation[0] @ turn.T
+        rotation = integrated_turn(near, times, bias)
+        return None if rotation is None else turn @ rotation @ turn.T
 
     def turns_about(self, time: float, offsets: Array) -> Array | None:
         """Orientations of the camera about the time of a frame by the gyroscope, whose newest sample is held.
@@ -897,11 +901,15 @@ def _step(state: BodyState, time: float, offset: float, samples: InertialSamples
     near = _held(samples.between(times[0] - 0.5, times[1] + 0.5), times[1])
     if len(near) < 2:
         return state
-    moved = propagate(
-        state.rotation, state.position, state.velocity, near, times, state.gyro_bias, state.accel_bias, GRAVITY
-    )
-    rotation, position, velocity = (part[1] for part in moved)
-    motion = preintegrate(near, times, state.gyro_bias, state.accel_bias, noise)
+    motion, span = preintegrate(near, times, state.gyro_bias, state.accel_bias, noise), time - state.time
+    if motion.covered[0]:
+        rotation = state.rotation @ motion.rotation[0]
+        velocity = state.velocity + GRAVITY * span + state.rotation @ motion.velocity[0]
+        position = state.position + 0.5 * (2 * state.velocity + GRAVITY * span) * span
+        position = position + state.rotation @ motion.position[0]
+    else:
+        known = state.rotation, state.position, state.velocity, near, times, state.gyro_bias, state.accel_bias
+        rotation, position, velocity = (part[1] for part in propagate(*known, GRAVITY))
     pair = (
         np.stack([state.rotation, rotation]),
         np.stack([state.position, position]),
@@ -914,7 +922,7 @@ def _step(state: BodyState, time: float, offset: float, samples: InertialSamples
     forward, added = np.eye(size), np.zeros((size, size))
     forward[:9, :STATE] = -back @ before[0]
     added[:9, :9] = back @ own[0] @ back.T
-    walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3) ** 2 * (time - state.time)
+    walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3) ** 2 * span
     added[range(9, STATE), range(9, STATE)] = walk
     covariance = forward @ state.covariance @ forward.T + added
     sigma = float(np.sqrt(np.trace(covariance[6:9, 6:9])))

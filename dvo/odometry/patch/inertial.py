@@ -77,6 +77,7 @@ class InertialTracking:
         self.coupling = InertialCoupling(self.estimator, self._similarity, variance, optimised)
         # Squares, of errors of the gyroscope and of the motion model, and of turns between frames, rad^2.
         self._errors: tuple[float, float, float] | None = None
+        self._turn: tuple[float, float, np.ndarray | None] | None = None  # newest by the gyroscope, between two times
         self._read_at_once = 0  # frames
         self._last: tuple[float, np.ndarray] | None = None  # time and pose T_wc of the last frame with one
         self._before: tuple[float, np.ndarray] | None = None  # and of the one before it
@@ -151,12 +152,13 @@ class InertialTracking:
             return pose_cw
         return se3.inverse(torch.from_numpy(pose_from(turned, position))).to(pose_cw)
 
-    def express(self, record: FrameRecord, estimate: Estimate) -> Estimate:
+    def express(self, record: FrameRecord, estimate: Estimate, *, moved: bool = True) -> Estimate:
         """Estimate for the caller.
 
         Args:
             record: of the frame.
             estimate: by the images.
+            moved: see :meth:`dvo.odometry.inertial.estimator.InertialEstimator.refresh`.
 
         Returns:
             In metres and upright once that is known; a predicted pose where the images give none.
@@ -167,7 +169,7 @@ class InertialTracking:
             if self.metric:
                 return estimate
             if self._anchor is None:
-                estimator.refresh(time, self._nodes)
+                estimator.refresh(time, self._nodes, moved=moved)
             else:
                 estimator.update(*self._nodes(time - self.options.window))
             similarity = self._similarity()
@@ -288,7 +290,9 @@ class InertialTracking:
         """Orientation ``(3, 3)`` of the camera by the gyroscope, from the last frame with a pose on."""
         if self._last is None or not 0 < time - self._last[0] < self.options.longest:
             return None
-        turn = self.estimator.turn_between(self._last[0], time)
+        if self._turn is None or self._turn[:2] != (self._last[0], time):
+            self._turn = self._last[0], time, self.estimator.turn_between(self._last[0], time)
+        turn = self._turn[2]
         return None if turn is None else split(self._last[1])[0] @ turn
 
     def _compare(self, time: float, pose_wc: np.ndarray) -> None:

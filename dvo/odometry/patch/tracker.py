@@ -187,7 +187,10 @@ class PatchOdometry:
         else:
             estimate = self._lose(record, admitted.problem) if admitted.problem else self._measure(record, admitted)
         self.state.last = estimate
-        return self.inertial.express(record, estimate) if self.inertial.active else estimate
+        if not self.inertial.active:
+            return estimate
+        moved = not admitted.repeated and (self.aligner is None or self.aligner.age == 0)
+        return self.inertial.express(record, estimate, moved=moved)
 
     def _remember(self, admitted: Admitted) -> None:
         """Keep a frame at the beginning of a recording; with other sensors, and in real time, none begins anew."""

@@ -101,6 +101,20 @@ def test_an_estimate_that_goes_on_is_that_of_the_whole_window() -> None:
     assert gone_on < 0.3 * left
 
 
+@pytest.mark.parametrize(("moved", "least", "most"), [(True, 5, 8), (False, 1, 2)])
+def test_frames_that_have_moved_little_wait_for_an_estimate_of_the_whole_window(
+    moved: bool, least: int, most: int
+) -> None:
+    recording = record(0, seconds=8.0)
+    estimator, found = drive(recording, until=6.0)[0], set()
+    for time in recording.times[(recording.times > 6.0) & (recording.times < 7.5)]:
+        estimator.add(recording.samples.between(estimator.stream.end, time))
+        estimator.refresh(time, lambda since, until=time: (recording.nodes(since, until), [0]), moved=moved)
+        assert estimator.solution is not None
+        found.add(float(estimator.solution.times[-1]))
+    assert least <= len(found) - 1 <= most
+
+
 @pytest.mark.long
 def test_alignment_follows_a_stretch_that_does_not_tell() -> None:
     estimator, _ = drive(record(2, still=5.0, turning=False, seconds=11.0))

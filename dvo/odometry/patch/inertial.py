@@ -78,7 +78,7 @@ class InertialTracking:
         # Squares, of errors of the gyroscope and of the motion model, and of turns between frames, rad^2.
         self._errors: tuple[float, float, float] | None = None
         self._turn: tuple[float, float, np.ndarray | None] | None = None  # newest by the gyroscope, between two times
-        self._read_at_once = 0  # frames
+        self._read_at_once, self._readout = 0, 0.0  # frames, and seconds
         self._last: tuple[float, np.ndarray] | None = None  # time and pose T_wc of the last frame with one
         self._before: tuple[float, np.ndarray] | None = None  # and of the one before it
         self._anchor: BodyState | None = None  # from which poses are predicted, while there are none by images
@@ -107,14 +107,14 @@ class InertialTracking:
         turns = self.estimator.turns_about(admitted.timestamp, offsets)
         if turns is None:
             return admitted
-        self._read_at_once += 1
+        self._read_at_once, self._readout = self._read_at_once + 1, camera.readout
         image = read_at_once(admitted.image, camera, offsets, turns)
         return replace(admitted, image=image, camera=replace(camera, readout=0.0))
 
     @property
-    def corrects_shutter(self) -> bool:
-        """True if most frames so far are without a rolling shutter, see :meth:`read_at_once`."""
-        return 2 * self._read_at_once > len(self.graph.log.frames)
+    def readout(self) -> float:
+        """Readout time that most frames so far have been corrected for, see :meth:`read_at_once`; 0: they have not."""
+        return self._readout if 2 * self._read_at_once > len(self.graph.log.frames) else 0.0
 
     def add(self, samples: InertialSamples) -> None:
         """Take samples.

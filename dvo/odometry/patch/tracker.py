@@ -180,7 +180,7 @@ class PatchOdometry:
         record = self.graph.log.add(admitted.timestamp)
         if not (admitted.repeated or admitted.problem):
             admitted = self.inertial.read_at_once(admitted)
-        readout = 0.0 if self.inertial.corrects_shutter else admitted.camera.readout
+        readout = 0.0 if self.inertial.readout > 0 else admitted.camera.readout
         state.shutter = Shutter(readout, admitted.camera.height / self.model.config.STRIDE)
         if admitted.repeated:
             estimate = self._repeat(record)
@@ -272,11 +272,13 @@ class PatchOdometry:
             self._close_segment()
             self.loops.complete(state.adjustable)
             state.shutter = replace(state.shutter, turns=self.inertial.turns())
-            estimate = self.config.estimate_readout and not self.inertial.corrects_shutter
-            config = replace(self.config, estimate_readout=estimate)
+            readout = self.inertial.readout
+            config = replace(self.config, estimate_readout=self.config.estimate_readout and readout == 0)
             state.info |= finish_segments(self.graph, state, config, self.loops)
             state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
             state.info |= self.inertial.settle(self.loops)
+            if readout > 0:
+                state.info |= {"readout": readout, "readout_from": "gyroscope"}
         return replace(self._result({}), quality=state.quality)
 
     @torch.inference_mode()

@@ -227,15 +227,14 @@ class InertialEstimator:
         Args:
             time: of the newest frame, seconds.
             nodes: gives the visual poses from a time on, and the world of each of their segments.
-            moved: since the last estimate by more than a little; otherwise that of the whole window is waited for.
+            moved: by more than a little; once it is aligned, a frame that has not needs no estimate.
         """
         if self.state is ScaleState.NONE or time < self._next:
             return
         past = self.solution.past if self.solution is not None and self.aligned else None
-        whole = past is None or time > self._whole + EVERY - 1e-6
-        if past is not None and not whole and moved:
-            whole = not self._go_on(past, *nodes(past.time))
-        if whole:
+        if past is not None and not moved:
+            return
+        if past is None or time > self._whole + EVERY - 1e-6 or not self._go_on(past, *nodes(past.time)):
             self.update(*nodes(time - self.options.window))
 
     def update(self, nodes: VisualNodes, worlds: list[int]) -> None:

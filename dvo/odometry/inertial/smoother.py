@@ -87,7 +87,7 @@ class SmootherOptions:
         rotation_walk: their drift in a second, rad.
         position_sigma, position_walk: noise of visual displacements: of their ends, and of a second, in depths of the
             scene.
-        scale_walk: drift of the scale in a second, relative.
+        scale_walk: drift of the scale in a second, relative; of a window that samples do not lead.
         rotation_factor, position_factor, scale_factor: of the noise of these.
         extrinsic_sigma: of the rotation between sensor and camera, rad.
         offset_sigma: of the time offset, seconds.
@@ -98,7 +98,7 @@ class SmootherOptions:
     rotation_walk: float = 2e-3
     position_sigma: float = 3e-4
     position_walk: float = 1.5e-3
-    scale_walk: float = 1.5e-2
+    scale_walk: float = 3e-2
     rotation_factor: float = 1.0
     position_factor: float = 1.0
     scale_factor: float = 1.0

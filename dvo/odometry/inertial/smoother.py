@@ -98,7 +98,7 @@ class SmootherOptions:
     rotation_walk: float = 2e-3
     position_sigma: float = 3e-4
     position_walk: float = 1.5e-3
-    scale_walk: float = 3e-2
+    scale_walk: float = 2e-2
     rotation_factor: float = 1.0
     position_factor: float = 1.0
     scale_factor: float = 1.0

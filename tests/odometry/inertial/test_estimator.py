@@ -79,7 +79,7 @@ def test_an_estimate_that_goes_on_is_that_of_the_whole_window() -> None:
     """For a second, from what the poses before the last two seconds told."""
     differences = []
     for seed in range(3):
-        recording = record(seed, seconds=9.0, walk=2e-3, unit=3e-2)
+        recording = record(seed, seconds=9.0, walk=2e-3, unit=2e-2)
         estimator, later = drive(recording, until=7.0)[0], iter(recording.times[recording.times > 7.0])
         first = estimator.solution
         while first is not None and estimator.solution is not None and estimator.solution.past is first.past:
@@ -236,7 +236,7 @@ def _consistency(recording: Recording, window: float, *, led: bool = False) -> n
 def test_poses_err_as_much_as_their_covariance_says(grade: str) -> None:
     """Also when the window has left the alignment behind, with images whose heading and unit drift."""
     found = [
-        _consistency(record(20 + seed, seconds=16.0, grade=grade, walk=2e-3, unit=3e-2), window=6.0)
+        _consistency(record(20 + seed, seconds=16.0, grade=grade, walk=2e-3, unit=2e-2), window=6.0)
         for seed in range(4)
     ]
     assert (np.mean([rows.mean(0) for rows in found], 0) > 0.35).all()
@@ -245,7 +245,7 @@ def test_poses_err_as_much_as_their_covariance_says(grade: str) -> None:
 
 def test_a_window_that_samples_lead_tells_no_more_of_their_bias() -> None:
     """Its turns agree with those of the gyroscope, whatever the bias is and however noisy the images are."""
-    recordings = [record(20 + seed, seconds=20.0, walk=4e-3, unit=3e-2) for seed in range(2)]
+    recordings = [record(20 + seed, seconds=20.0, walk=4e-3, unit=2e-2) for seed in range(2)]
     found = [_consistency(recording, window=20.0, led=True)[:, 1].mean() for recording in recordings]
     assert 0.3 < np.mean(found) < 1.5
 

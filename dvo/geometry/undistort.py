@@ -1,4 +1,5 @@
-"""Lens distortion: functions on points, and the resampling of images to a camera without distortion.
+"""Lens distortion: functions on points, and the resampling of images to a camera without distortion; and to one without
+a rolling shutter, as far as the camera turns.
 
 The models are those of :mod:`dvo.geometry.lenses`.
 """
@@ -22,6 +23,7 @@ from dvo.geometry.lenses import (
     undistort_to_rays,
 )
 
+_CELLS = 16  # of the grid, on each axis, on which the rows of a rolling shutter are corrected
 _FAR_OFF = -1e4  # pixels, outside of every image
 
 
@@ -100,6 +102,39 @@ def in_range(points: np.ndarray, camera: Camera) -> np.ndarray:
         ``(...)`` bool, True where the distorted radius grows all the way from the centre to the point.
     """
     return in_range_plane(np.asarray(points, dtype=np.float64), camera.model, camera.coefficients)
+
+
+def read_at_once(image: np.ndarray, camera: Camera, offsets: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Image of a rolling shutter as if all rows had been read at the time of the frame by a camera that only turns.
+
+    Args:
+        image: ``(H, W, 3)`` uint8 of a camera without lens distortion.
+        camera: of the image; its ``readout`` is above 0.
+        offsets: ``(S,)`` increasing seconds relative to the time of the frame, which span the readout.
+        turns: ``(S, 3)`` rotation vectors from the orientation at the time of the frame to those at the offsets, in
+            the axes of the camera, rad.
+
+    Returns:
+        ``(H, W, 3)`` uint8; what lies outside of the image repeats its border.
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    u, v = np.meshgrid(np.linspace(0, width - 1, _CELLS + 1), np.linspace(0, height - 1, _CELLS + 1))
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    row = v
+    for _ in range(3):  # the row that shows a point is one that is near
+        time = (row - (height - 1) / 2) * camera.readout / height
+        turn = np.stack([np.interp(time, offsets, axis) for axis in turns.T], -1)
+        seen = rays - np.cross(turn, rays)  # a camera turns by a few hundredths of a radian in a readout
+        x, y = np.moveaxis(seen[..., :2] / seen[..., 2:], -1, 0)
+        column, row = x * camera.fx + camera.cx, y * camera.fy + camera.cy
+    across, down = (np.linspace(0, _CELLS, size, dtype=np.float32) for size in (width, height))
+    grid = np.meshgrid(across, down)
+    shift = np.stack([column - u, row - v], -1).astype(np.float32)
+    x, y = np.moveaxis(cv2.remap(shift, *grid, cv2.INTER_LINEAR), -1, 0)
+    x, y = x + np.arange(width, dtype=np.float32), y + np.arange(height, dtype=np.float32)[:, None]
+    return cv2.remap(np.ascontiguousarray(image), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _scaled(camera: Camera, scale: float) -> Camera:

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
-from dvo.geometry.undistort import Undistorter, distort, undistort, undistorted_camera
+from dvo.geometry.poses import so3_exp
+from dvo.geometry.undistort import Undistorter, distort, read_at_once, undistort, undistorted_camera
 
 # real lenses: TUM RGB-D freiburg1, EuRoC cam0, TUM-VI cam0
 FR1 = Camera(517.3, 516.5, 318.6, 255.3, 640, 480, "radtan", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
@@ -185,3 +186,23 @@ def test_the_readout_suits_the_rows_of_the_result(camera):
 
 def test_a_pinhole_keeps_its_readout():
     assert undistorted_camera(Camera(50, 50, 31, 23, 64, 48, readout=0.02)).readout == 0.02
+
+
+def test_rows_that_a_turning_camera_reads_one_after_the_other_are_those_of_one_time():
+    camera, rate = Camera(200.0, 210.0, 150.0, 110.0, 320, 240, readout=0.02), np.array([0.8, -1.5, 2.0])
+    u, v = np.meshgrid(np.arange(320.0), np.arange(240.0))
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+
+    def image(turns: np.ndarray) -> np.ndarray:
+        x, y, z = np.moveaxis((turns @ rays[..., None])[..., 0], -1, 0)
+        return np.stack([128 + 100 * np.sin(20 * x / z + k) * np.cos(17 * y / z) for k in range(3)], -1).astype(
+            np.uint8
+        )
+
+    times = (v - 119.5) * camera.readout / 240
+    rolled, wanted = image(so3_exp(times[..., None] * rate)), image(np.eye(3)).astype(float)
+    offsets = np.linspace(-0.01, 0.01, 5)
+    found = read_at_once(rolled, camera, offsets, offsets[:, None] * rate)
+    inside = np.s_[8:-8, 8:-8]
+    before, after = (np.abs(x.astype(float) - wanted)[inside].mean() for x in (rolled, found))
+    assert before > 5 and after < 1

@@ -26,7 +26,7 @@ from dvo.ba.kernels import Kernel
 from dvo.ba.problem import Factor
 from dvo.data.frame import Frame
 from dvo.geometry import se3
-from dvo.geometry.poses import pose_from, skew
+from dvo.geometry.poses import pose_from
 from dvo.map.window import Window
 from dvo.odometry.inertial.estimator import InertialEstimator, Similarity
 from dvo.odometry.inertial.factors import inertial_factors
@@ -37,9 +37,6 @@ LEAST_TURN_SIGMA = 5e-4
 """Deviation of the rotation of an interval at least, rad; that of visual rotations is about 1e-3."""
 LEAST_SHIFT = 2e-4
 """Deviation of the time offset at least, seconds."""
-MAX_FORCE_SIGMA = 0.025
-"""Deviation of the acceleration, m/s^2, by bias and vertical together, above which samples hold a velocity no better
-than images do, and are no measurement for the window."""
 WIDTH = 6.0
 """Of the robust kernel of an interval, deviations."""
 
@@ -129,7 +126,7 @@ class InertialCoupling:
     def _intervals(self, window: Window) -> _Intervals | None:
         """Intervals between the keyframes of a window; None without an alignment, or without samples."""
         solution, similarity = self.estimator.solution, self.similarity()
-        if not self.estimator.aligned or solution is None or similarity is None or window.guests or len(window) < 3:
+        if not self.estimator.leads or solution is None or similarity is None or window.guests or len(window) < 3:
             return None
         times = [frame.timestamp for frame in window.frames]
         if self._made is None or self._made[0] is not solution or self._made[1] != times:
@@ -160,19 +157,15 @@ class InertialCoupling:
             velocity_by_gyro=motion.velocity_by_gyro / scale, velocity_by_accel=motion.velocity_by_accel / scale,
             position_by_gyro=motion.position_by_gyro / scale, position_by_accel=motion.position_by_accel / scale,
         )  # fmt: skip
-        # An error of the vertical is one of the acceleration, and one of the scale is none of the velocity in units.
-        by = np.zeros((9, len(solution.covariance)))
-        by[:3, 9:12] = by[3:6, 12:15] = by[6:, 6:9] = np.eye(3)
-        by[3:6, :3] = -skew(solution.rotation[-1].T @ GRAVITY)
-        by[6:, NODE - 1] = by[6:, -4] = -solution.velocity[-1]
-        variance = np.diag(by @ solution.covariance @ by.T)
-        if variance[3:6].mean() > MAX_FORCE_SIGMA**2:
-            return None
-        speed = float(variance[6:].mean()) + float(np.trace((start.covariance - newest.covariance)[6:9, 6:9])) / 3
+        # An error of the scale is none of the velocity in units.
+        by = np.zeros((3, len(solution.covariance)))
+        by[:, 6:9], by[:, NODE - 1], by[:, -4] = np.eye(3), -solution.velocity[-1], -solution.velocity[-1]
+        speed = np.trace(by @ solution.covariance @ by.T + (start.covariance - newest.covariance)[6:9, 6:9]) / 3
+        bias_variance = np.concatenate([np.diag(solution.covariance)[9:12], solution.force_variance])
         extrinsics = pose_from(solution.rotation_camera_imu, self.estimator.translation_camera_imu / scale)
         return _Intervals(
-            motion, first, similarity.rotation.T @ start.velocity / scale, speed / scale**2,
-            np.concatenate(bias), variance[:6], similarity.rotation.T @ GRAVITY / scale, extrinsics,
+            motion, first, similarity.rotation.T @ start.velocity / scale, float(speed) / scale**2,
+            np.concatenate(bias), bias_variance, similarity.rotation.T @ GRAVITY / scale, extrinsics,
         )  # fmt: skip
 
 

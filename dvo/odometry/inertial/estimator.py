@@ -16,7 +16,7 @@ import numpy as np
 from dvo.data.inertial import NOISE_PRESETS, ImuNoise, InertialSamples
 from dvo.geometry.poses import rotation_vector, skew, so3_exp, split
 from dvo.odometry.inertial.options import InertialOptions
-from dvo.odometry.inertial.preintegration import preintegrate, propagate
+from dvo.odometry.inertial.preintegration import integrated_turn, preintegrate, propagate
 from dvo.odometry.inertial.smoother import (
     GRAVITY,
     NODE,
@@ -64,6 +64,9 @@ FOUND_EXTRINSIC = 0.02
 """Deviation of a rotation between sensor and camera that was found from the motion, rad."""
 NOISE_RANGE = (0.3, 30.0)
 """Factors of the noise of visual poses."""
+MAX_FORCE_SIGMA = 0.025
+"""Deviation of the acceleration, m/s^2, by bias and vertical together, above which samples hold a velocity no better
+than images do, and are no measurement for the window."""
 MAX_ROTATION_FACTOR = 8.0
 """Factor of the noise of visual orientations above which samples and images do not fit."""
 MAX_SHIFT = 0.02
@@ -80,6 +83,8 @@ _WAITING = ("too few poses", "too few samples")
 SURE_OFFSET, SURE_TURN = 3e-3, 0.5
 """Deviation of the time offset, seconds, and of rotations over a third of a second, degrees, of a gyroscope that tells
 the rotation within a readout."""
+HELD = 0.05
+"""Seconds for which the newest sample is held."""
 LONGEST_GAP = 0.02
 """Between samples that tell a rotation within a readout, seconds."""
 STILL = (0.02, 0.15)
@@ -188,6 +193,12 @@ class InertialEstimator:
         """True if poses are in metres."""
         return self.state in (ScaleState.ALIGNED, ScaleState.REFINED)
 
+    @property
+    def leads(self) -> bool:
+        """True if samples tell the acceleration well enough to be a measurement for the window."""
+        s = self.solution
+        return self.aligned and s is not None and float(s.force_variance.mean()) <= MAX_FORCE_SIGMA**2
+
     def add(self, samples: InertialSamples) -> None:
         """Take samples; the first with an extrinsic calibration and noise decide these.
 
@@ -208,16 +219,21 @@ class InertialEstimator:
             rotation, translation = split(np.asarray(samples.T_camera_imu, float))
             self.rotation_camera_imu, self.translation_camera_imu = rotation, translation
 
-    def refresh(self, time: float, nodes: Callable[[float], tuple[VisualNodes, list[int]]]) -> None:
+    def refresh(
+        self, time: float, nodes: Callable[[float], tuple[VisualNodes, list[int]]], *, moved: bool = True
+    ) -> None:
         """Make the next estimate if it is due: of the whole window, or one that goes on from it.
 
         Args:
             time: of the newest frame, seconds.
             nodes: gives the visual poses from a time on, and the world of each of their segments.
+            moved: by more than a little; once it is aligned, a frame that has not needs no estimate.
         """
         if self.state is ScaleState.NONE or time < self._next:
             return
         past = self.solution.past if self.solution is not None and self.aligned else None
+        if past is not None and not moved:
+            return
         if past is None or time > self._whole + EVERY - 1e-6 or not self._go_on(past, *nodes(past.time)):
             self.update(*nodes(time - self.options.window))
 
@@ -249,7 +265,7 @@ class InertialEstimator:
         if found is None:
             self._refuse("the motion does not tell scale and gravity", time)
             return
-        self._adapt(found)
+        self._adapt(found, led=self.leads)
         reason = self._doubt(problem, found)
         if not reason and worlds[-1] in self.worlds and found.scale_sigma > LOST_SCALE:
             reason = f"the scale is uncertain by {100 * found.scale_sigma:.0f} %"
@@ -410,10 +426,28 @@ class InertialEstimator:
         near = self.stream.near(times[0] - 0.1, times[1] + 0.1)
         if near is None or len(near) < 2:
             return None
-        motion = preintegrate(near, times, bias, np.zeros(3), self.noise)
-        if not motion.covered.all():
+        rotation = integrated_turn(near, times, bias)
+        return None if rotation is None else turn @ rotation @ turn.T
+
+    def turns_about(self, time: float, offsets: Array) -> Array | None:
+        """Orientations of the camera about the time of a frame by the gyroscope, whose newest sample is held.
+
+        Args:
+            time: of the frame, seconds, clock of the camera.
+            offsets: ``(S,)`` seconds relative to it, some hundredths at most.
+
+        Returns:
+            ``(S, 3)`` rotation vectors from the orientation at the time to those at the offsets, in the axes of the
+            camera, rad; None without samples, or if the rotation between sensor and camera is not known.
+        """
+        turn, bias = self.rotation_camera_imu, np.zeros(3) if self.solution is None else self.solution.gyro_bias[-1]
+        time += self.first_offset if self.solution is None else self.solution.time_offset
+        near = self.stream.near(time - HELD, time + HELD)
+        if turn is None or near is None or near.timestamps[0] > time:
             return None
-        return turn @ motion.rotation[0] @ turn.T
+        columns = [np.interp(np.append(time + offsets, time), near.timestamps, axis) for axis in near.gyro.T]
+        rates = np.stack(columns, -1) - bias
+        return 0.5 * (rates[:-1] + rates[-1]) * offsets[:, None] @ turn.T
 
     def turns(self, nodes: VisualNodes) -> Callable[[Array, Array], Array] | None:
         """What the gyroscope tells of rotations about the times of frames, also without an alignment.
@@ -698,9 +732,9 @@ class InertialEstimator:
                 f"gyroscope and images turn differently, by {angle:.1f} degrees: axes, time offset or clock"
             )
 
-    def _adapt(self, found: Smoothed) -> None:
-        """Follow the noise of the visual poses."""
-        factors = np.clip(np.sqrt(found.visual_error), 0.7, 1.4)
+    def _adapt(self, found: Smoothed, *, led: bool = False) -> None:
+        """Follow the noise of the visual poses; those that samples lead agree with them, whatever the noise is."""
+        factors = np.clip(np.sqrt(found.visual_error), 1.0 if led else 0.7, 1.4)
         known = self._smoother
         now = np.array([known.rotation_factor, known.position_factor, known.scale_factor])
         rotation, position, scale = np.clip(now * factors, *NOISE_RANGE).tolist()
@@ -851,17 +885,30 @@ def _words(reason: str) -> str:
     return "".join(letter for letter in reason if not letter.isdigit())
 
 
+def _held(samples: InertialSamples, until: float) -> InertialSamples:
+    """Samples of which the newest is held until a time soon after it, as where the sensor's clock is ahead."""
+    stamps = samples.timestamps
+    if not len(samples) or not 0 < until - stamps[-1] < HELD:
+        return samples
+    gyro, accel = (np.concatenate([values, values[-1:]]) for values in (samples.gyro, samples.accel))
+    return replace(samples, timestamps=np.append(stamps, until), gyro=gyro, accel=accel)
+
+
 def _step(state: BodyState, time: float, offset: float, samples: InertialSamples, noise: ImuNoise) -> BodyState:
     """State at a later time."""
     times = np.array([state.time, time]) + offset
-    near = samples.between(times[0] - 0.5, times[1] + 0.5)
+    near = _held(samples.between(times[0] - 0.5, times[1] + 0.5), times[1])
     if len(near) < 2:
         return state
-    moved = propagate(
-        state.rotation, state.position, state.velocity, near, times, state.gyro_bias, state.accel_bias, GRAVITY
-    )
-    rotation, position, velocity = (part[1] for part in moved)
-    motion = preintegrate(near, times, state.gyro_bias, state.accel_bias, noise)
+    motion, span = preintegrate(near, times, state.gyro_bias, state.accel_bias, noise), time - state.time
+    if motion.covered[0]:
+        rotation = state.rotation @ motion.rotation[0]
+        velocity = state.velocity + GRAVITY * span + state.rotation @ motion.velocity[0]
+        position = state.position + 0.5 * (2 * state.velocity + GRAVITY * span) * span
+        position = position + state.rotation @ motion.position[0]
+    else:
+        known = state.rotation, state.position, state.velocity, near, times, state.gyro_bias, state.accel_bias
+        rotation, position, velocity = (part[1] for part in propagate(*known, GRAVITY))
     pair = (
         np.stack([state.rotation, rotation]),
         np.stack([state.position, position]),
@@ -874,7 +921,7 @@ def _step(state: BodyState, time: float, offset: float, samples: InertialSamples
     forward, added = np.eye(size), np.zeros((size, size))
     forward[:9, :STATE] = -back @ before[0]
     added[:9, :9] = back @ own[0] @ back.T
-    walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3) ** 2 * (time - state.time)
+    walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3) ** 2 * span
     added[range(9, STATE), range(9, STATE)] = walk
     covariance = forward @ state.covariance @ forward.T + added
     sigma = float(np.sqrt(np.trace(covariance[6:9, 6:9])))

@@ -138,6 +138,23 @@ def preintegrate(
     return Preintegration(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Preintegration)))
 
 
+def integrated_turn(samples: InertialSamples, times: Array, gyro_bias: Array) -> Array | None:
+    """Rotation over one interval, as :func:`preintegrate` gives it, and nothing else.
+
+    Args:
+        samples, times, gyro_bias: see there; two times.
+
+    Returns:
+        ``(3, 3)``; None where samples do not cover the interval.
+    """
+    samples, stamps = _checked(samples, times), samples.timestamps
+    reach = _reach(stamps)
+    if len(stamps) < 2 or times[0] < stamps[0] - reach or times[1] > stamps[-1] + reach:
+        return None
+    found: Array = _Steps.between(samples, times, gyro_bias, np.zeros(3)).rotation[-1]
+    return found
+
+
 def propagate(
     rotation: Array,
     position: Array,
@@ -333,13 +350,17 @@ def _effect(s: _Steps, last: Array) -> Array:
     return out
 
 
+def _reach(stamps: Array) -> float:
+    """Time without samples beyond which there is a gap, seconds."""
+    return GAP * float(np.median(np.diff(stamps))) * (1 + 1e-9) if len(stamps) > 1 else 0.0
+
+
 def _uncertainty(samples: InertialSamples, s: _Steps, times: Array, noise: ImuNoise) -> tuple[Array, Array, Array]:
     """Variance of the mean rate and force of each step ``(S, 2)``; of each interval the longest time without a sample,
     and whether it is covered."""
     stamps, variance = samples.timestamps, np.array([noise.gyro, noise.accel]) ** 2 / s.dt
-    median = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    before, after = times[:-1], times[1:]
-    reach = GAP * median * (1 + 1e-9)
+    before, after, reach = times[:-1], times[1:], _reach(stamps)
+    median = reach / GAP
     covered = (before >= stamps[0] - reach) & (after <= stamps[-1] + reach) & (len(stamps) > 1)
     middle = (s.knots[:-1] + s.knots[1:]) / 2
     bounds = np.concatenate([[-np.inf], stamps, [np.inf]])

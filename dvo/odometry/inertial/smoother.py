@@ -87,7 +87,7 @@ class SmootherOptions:
         rotation_walk: their drift in a second, rad.
         position_sigma, position_walk: noise of visual displacements: of their ends, and of a second, in depths of the
             scene.
-        scale_walk: drift of the scale in a second, relative.
+        scale_walk: drift of the scale in a second, relative; of a window that samples do not lead.
         rotation_factor, position_factor, scale_factor: of the noise of these.
         extrinsic_sigma: of the rotation between sensor and camera, rad.
         offset_sigma: of the time offset, seconds.
@@ -98,7 +98,7 @@ class SmootherOptions:
     rotation_walk: float = 2e-3
     position_sigma: float = 3e-4
     position_walk: float = 1.5e-3
-    scale_walk: float = 1.5e-2
+    scale_walk: float = 2e-2
     rotation_factor: float = 1.0
     position_factor: float = 1.0
     scale_factor: float = 1.0
@@ -194,6 +194,16 @@ class Smoothed:
         """Standard deviation of the vertical at the newest node, degrees."""
         turned = self.rotation[-1] @ self.covariance[:3, :3] @ self.rotation[-1].T
         return float(np.rad2deg(np.sqrt(turned[0, 0] + turned[1, 1])))
+
+    @property
+    def force_variance(self) -> Array:
+        """``(3,)`` variances of the acceleration at the newest node, in the axes of the sensor, (m/s^2)^2.
+
+        What is not known of the vertical acts as a bias of the accelerometer.
+        """
+        by = np.zeros((3, len(self.covariance)))
+        by[:, 12:STATE], by[:, :3] = np.eye(3), -skew(self.rotation[-1].T @ GRAVITY)
+        return ((by @ self.covariance) * by).sum(1)
 
 
 @dataclass

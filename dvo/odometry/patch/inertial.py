@@ -18,9 +18,11 @@ from dvo.data.inertial import InertialSamples, checked_samples
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
 from dvo.geometry.poses import matrix_to_quaternion, pose_from, quaternion_to_matrix, rotation_vector, slerp, split
+from dvo.geometry.undistort import read_at_once
 from dvo.map.correction import Carried, Moved, apply_similarities, keyframes_of
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
+from dvo.odometry.frames.gate import Admitted
 from dvo.odometry.global_ba.rolling_shutter import Turns
 from dvo.odometry.inertial.coupling import InertialCoupling
 from dvo.odometry.inertial.estimator import (
@@ -41,6 +43,8 @@ model: a sensor that is turned, or whose clock is off, predicts worse."""
 LEAST_TURN = np.deg2rad(1.0)
 """Difference of the two predictions below which that of the motion model stays: the network finds the rest, and calm
 images give the same bytes with and without samples."""
+MOST_WRONG, LEAST_WRONG = 0.5, np.deg2rad(0.5)
+"""Share of the turn between frames by which the gyroscope may err, or else angle, where it tells that in a readout."""
 FORGET = 0.9
 """Weight of the past in these errors, from frame to frame."""
 MOST_NODES = 400
@@ -71,7 +75,10 @@ class InertialTracking:
         self._unused = ""  # why samples are not used
         self.estimator = InertialEstimator(options)
         self.coupling = InertialCoupling(self.estimator, self._similarity, variance, optimised)
-        self._errors: tuple[float, float] | None = None  # squared, of the gyroscope and of the motion model, rad^2
+        # Squares, of errors of the gyroscope and of the motion model, and of turns between frames, rad^2.
+        self._errors: tuple[float, float, float] | None = None
+        self._turn: tuple[float, float, np.ndarray | None] | None = None  # newest by the gyroscope, between two times
+        self._read_at_once, self._readout = 0, 0.0  # frames, and seconds
         self._last: tuple[float, np.ndarray] | None = None  # time and pose T_wc of the last frame with one
         self._before: tuple[float, np.ndarray] | None = None  # and of the one before it
         self._anchor: BodyState | None = None  # from which poses are predicted, while there are none by images
@@ -81,6 +88,33 @@ class InertialTracking:
     def turns(self) -> Turns | None:
         """Rotations by the gyroscope, for the readout of a rolling shutter; None if it does not tell them."""
         return self.estimator.turns(self._nodes(-np.inf)[0]) if self.active else None
+
+    def read_at_once(self, admitted: Admitted) -> Admitted:
+        """A frame of a rolling shutter without the turn during its readout, where the gyroscope has been right of late.
+
+        Args:
+            admitted: frame with content.
+
+        Returns:
+            The same, or one whose camera has a global shutter.
+        """
+        camera, errors = admitted.camera, self._errors
+        if not self.active or self.metric or camera.readout <= 0 or errors is None:
+            return admitted
+        if errors[0] > max(MOST_WRONG**2 * errors[2], LEAST_WRONG**2):
+            return admitted
+        offsets = np.linspace(-0.5, 0.5, 5) * camera.readout
+        turns = self.estimator.turns_about(admitted.timestamp, offsets)
+        if turns is None:
+            return admitted
+        self._read_at_once, self._readout = self._read_at_once + 1, camera.readout
+        image = read_at_once(admitted.image, camera, offsets, turns)
+        return replace(admitted, image=image, camera=replace(camera, readout=0.0))
+
+    @property
+    def readout(self) -> float:
+        """Readout time that most frames so far have been corrected for, see :meth:`read_at_once`; 0: they have not."""
+        return self._readout if 2 * self._read_at_once > len(self.graph.log.frames) else 0.0
 
     def add(self, samples: InertialSamples) -> None:
         """Take samples.
@@ -118,12 +152,13 @@ class InertialTracking:
             return pose_cw
         return se3.inverse(torch.from_numpy(pose_from(turned, position))).to(pose_cw)
 
-    def express(self, record: FrameRecord, estimate: Estimate) -> Estimate:
+    def express(self, record: FrameRecord, estimate: Estimate, *, moved: bool = True) -> Estimate:
         """Estimate for the caller.
 
         Args:
             record: of the frame.
             estimate: by the images.
+            moved: see :meth:`dvo.odometry.inertial.estimator.InertialEstimator.refresh`.
 
         Returns:
             In metres and upright once that is known; a predicted pose where the images give none.
@@ -134,7 +169,7 @@ class InertialTracking:
             if self.metric:
                 return estimate
             if self._anchor is None:
-                estimator.refresh(time, self._nodes)
+                estimator.refresh(time, self._nodes, moved=moved)
             else:
                 estimator.update(*self._nodes(time - self.options.window))
             similarity = self._similarity()
@@ -255,7 +290,9 @@ class InertialTracking:
         """Orientation ``(3, 3)`` of the camera by the gyroscope, from the last frame with a pose on."""
         if self._last is None or not 0 < time - self._last[0] < self.options.longest:
             return None
-        turn = self.estimator.turn_between(self._last[0], time)
+        if self._turn is None or self._turn[:2] != (self._last[0], time):
+            self._turn = self._last[0], time, self.estimator.turn_between(self._last[0], time)
+        turn = self._turn[2]
         return None if turn is None else split(self._last[1])[0] @ turn
 
     def _compare(self, time: float, pose_wc: np.ndarray) -> None:
@@ -267,7 +304,7 @@ class InertialTracking:
             if steps[1] > 0 and steps[0] < 2.5 * steps[1]:
                 still = rotation_vector(before.T @ last) * 0.5 * steps[0] / steps[1]
                 errors = rotation_vector(turned.T @ found), rotation_vector(last.T @ found) - still
-                now = tuple(float(error @ error) for error in errors)
+                now = tuple(float(error @ error) for error in (*errors, rotation_vector(last.T @ found)))
                 past = now if self._errors is None else self._errors
                 self._errors = tuple(FORGET * a + (1 - FORGET) * b for a, b in zip(past, now, strict=True))  # type: ignore[assignment]
         self._before, self._last = self._last, (time, pose_wc)

@@ -180,14 +180,20 @@ class PatchOdometry:
     def _process(self, admitted: Admitted) -> Estimate:
         """Process a frame that has passed the gate."""
         state = self.state
-        state.shutter = Shutter(admitted.camera.readout, admitted.camera.height / self.model.config.STRIDE)
         record = self.graph.log.add(admitted.timestamp)
+        if not (admitted.repeated or admitted.problem):
+            admitted = self.inertial.read_at_once(admitted)
+        readout = 0.0 if self.inertial.readout > 0 else admitted.camera.readout
+        state.shutter = Shutter(readout, admitted.camera.height / self.model.config.STRIDE)
         if admitted.repeated:
             estimate = self._repeat(record)
         else:
             estimate = self._lose(record, admitted.problem) if admitted.problem else self._measure(record, admitted)
         self.state.last = estimate
-        return self.inertial.express(record, estimate) if self.inertial.active else estimate
+        if not self.inertial.active:
+            return estimate
+        moved = not admitted.repeated and (self.aligner is None or self.aligner.age == 0)
+        return self.inertial.express(record, estimate, moved=moved)
 
     def _remember(self, admitted: Admitted) -> None:
         """Keep a frame at the beginning of a recording; with other sensors, and in real time, none begins anew."""
@@ -271,9 +277,13 @@ class PatchOdometry:
             self._close_segment()
             self.loops.complete(state.adjustable)
             state.shutter = replace(state.shutter, turns=self.inertial.turns())
-            state.info |= finish_segments(self.graph, state, self.config, self.loops)
+            readout = self.inertial.readout
+            config = replace(self.config, estimate_readout=self.config.estimate_readout and readout == 0)
+            state.info |= finish_segments(self.graph, state, config, self.loops)
             state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
             state.info |= self.inertial.settle(self.loops)
+            if readout > 0:
+                state.info |= {"readout": readout, "readout_from": "gyroscope"}
         return replace(self._result({}), quality=state.quality)
 
     @torch.inference_mode()

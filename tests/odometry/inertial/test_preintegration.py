@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from dvo.core.errors import DvoError
 from dvo.data.inertial import InertialSamples
 from dvo.geometry.poses import so3_exp
-from dvo.odometry.inertial.preintegration import CONTEXT, GAP, Preintegration, preintegrate, propagate
+from dvo.odometry.inertial.preintegration import CONTEXT, GAP, Preintegration, integrated_turn, preintegrate, propagate
 from dvo.synth.sensors.imu import rotation_vector
 from tests.support.inertial_motion import DOWN, NOISE, Motion
 
@@ -206,6 +206,14 @@ def test_the_kernel_equals_its_twin(monkeypatch: pytest.MonkeyPatch) -> None:
     twin = preintegrate(samples, times, *biases, NOISE)
     for name, value in vars(twin).items():
         assert np.allclose(getattr(found, name), value, rtol=1e-9, atol=1e-12), name
+
+
+def test_a_turn_alone_is_that_of_the_whole_integration() -> None:
+    samples, bias = random_samples(5), np.array([0.1, -0.2, 0.05])
+    times = samples.timestamps[0] + np.array([0.01, 0.2])
+    turned = integrated_turn(samples, times, bias)
+    np.testing.assert_allclose(turned, preintegrate(samples, times, bias, NONE, NOISE).rotation[0], atol=1e-12)
+    assert integrated_turn(samples, times - 1.0, bias) is None
 
 
 def test_samples_far_away_change_nothing() -> None:

@@ -50,7 +50,7 @@ def test_noise_of_the_images_is_found_beside_that_of_the_sensor(grade: str) -> N
     for factor in (0.5, 1.0):
         errors = []
         for seed in range(3):
-            problem = record(30 + seed, grade=grade, walk=2e-3, unit=1.5e-2).problem(0.1, 12.0)
+            problem = record(30 + seed, grade=grade, walk=2e-3, unit=2e-2).problem(0.1, 12.0)
             problem.options = smoother.SmootherOptions(
                 rotation_sigma=1e-3, position_sigma=1e-3, position_walk=0.0, rotation_factor=factor,
                 position_factor=factor,

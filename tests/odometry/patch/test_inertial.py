@@ -77,6 +77,17 @@ def test_until_it_is_aligned_the_output_equals_that_without_samples() -> None:
     assert "inertial" not in first.info and not second.metric
 
 
+@pytest.mark.parametrize(("error", "source"), [(0.002, "gyroscope"), (0.03, "camera")])
+def test_a_rolling_shutter_is_corrected_where_the_gyroscope_has_told_the_turns(error: float, source: str) -> None:
+    odometry = tracker()
+    for frame in with_samples(frames(8)):
+        odometry.track(replace(frame, camera=replace(frame.camera, readout=0.02)))
+        odometry.inertial._errors = error**2, 0.02**2, 0.02**2
+    assert (odometry.state.shutter.readout == 0.0) == (source == "gyroscope")
+    info = odometry.finish().info
+    assert (info["readout"], info["readout_from"]) == (0.02, source)
+
+
 def test_samples_are_ignored_on_request() -> None:
     odometry = tracker(replace(SMALL, inertial={"use": False}))
     estimates = [odometry.track(frame) for frame in with_samples(frames(8))]

@@ -81,8 +81,8 @@ def find_focal(
         shutter: timing of the rows; a rolling shutter that is not corrected is taken for another focal length.
         options: of the adjustment; its last kernel counts.
         beyond: logarithm of a factor; a profile whose minimum is nearer to the first value is of no interest. This is a
-            quick look, without the principal point: at half of the patches of the keyframes, with dropped ones up to
-            :data:`QUICK_FRAMES`, and with measurements that are corrected for a rolling shutter once.
+            quick look, without the principal point: at the keyframes, with dropped ones up to :data:`QUICK_FRAMES`, and
+            with measurements that are corrected for a rolling shutter once.
 
     Returns:
         The profile; that of the coarse steps alone where it is flat (:data:`MIN_CONTRAST`), or of no interest, then
@@ -98,7 +98,6 @@ def find_focal(
         kept = torch.tensor([frame.anchor is None for frame in frames])
         if not part.factors:
             part = part.select(thinned(kept, max(QUICK_FRAMES, int(kept.sum()))))
-        part = part.edges(part.kk % 2 == 0)
     solve = _Solver(
         part.planned(), times, shutter,
         replace(options, kernels=options.kernels[-1:], iterations=_ITERATIONS),

@@ -723,9 +723,11 @@ class InertialEstimator:
         off = rotation_vector(np.swapaxes(motion.rotation, -1, -2) @ np.swapaxes(turned[:-1], -1, -2) @ turned[1:])
         inside = motion.covered & (nodes.segment[1:] == nodes.segment[:-1])
         recent = inside & (nodes.times[:-1] >= nodes.times[-1] - LAST_TURNS)
+        # the first poses of a segment are the least sure
+        settled = nodes.times[-1] - nodes.times[nodes.segment == nodes.segment[-1]][0] > 2 * LAST_TURNS
         squares = (off**2).sum(-1)
         angle = float(np.rad2deg(np.sqrt(squares[inside].mean()))) if inside.any() else 0.0
-        if recent.any():  # a sensor that has just been hit; images that jump once do not count
+        if settled and recent.any():  # a sensor that has just been hit; images that jump once do not count
             angle = max(angle, float(np.rad2deg(np.sqrt(np.median(squares[recent])))))
         if angle > MAX_TURN:
             raise _DisagreementError(

@@ -393,6 +393,23 @@ def test_a_new_segment_after_the_dark_is_joined_and_withdraws_nothing() -> None:
     assert (estimator.worlds[4].rotation @ OTHER.rotation @ recording.turn)[2, 2] > np.cos(np.deg2rad(0.3))
 
 
+def test_the_first_poses_of_a_segment_do_not_accuse_the_sensor() -> None:
+    recording = record(11, seconds=14.0)
+    estimator, _ = drive(recording, until=7.0)
+    turned = so3_exp(np.outer(np.deg2rad(14.0) * np.clip(recording.times - 9.0, 0.0, 0.9), [0.0, 0.6, 0.8]))
+
+    def seen(since: float, time: float) -> tuple[VisualNodes, list[int]]:
+        spans = [(since, time)] if since >= 9.0 else [(0.0, 7.0), (9.0, time)]
+        nodes = parts(recording, spans, [SAME, OTHER][-len(spans) :])
+        rotation = nodes.rotation @ turned[np.searchsorted(recording.times, nodes.times)]
+        return replace(nodes, rotation=rotation), [0, 4][-len(spans) :]
+
+    for time in recording.times[(recording.times >= 9.0) & (recording.times < 13.0)]:
+        estimator.add(recording.samples.between(estimator.stream.end, time))
+        estimator.refresh(time, lambda since, time=time: seen(since, time))
+    assert [entry["event"] for entry in estimator.history] == ["aligned"]
+
+
 def test_a_segment_before_the_one_that_is_aligned_takes_no_part() -> None:
     recording = record(11, seconds=14.0)
     estimator = InertialEstimator(InertialOptions())

@@ -37,7 +37,8 @@ def test_two_maps_of_a_place_become_one(maps, tmp_path, capsys):
     assert np.array_equal(graph.log.trajectory(0).poses_wc, walk.trajectory.poses_wc)
     assert error_of_both(walk.trajectory, result.trajectory, truth) < 1.0
     assert len(graph.log.frames) == walk.frames_read + back.frames_read
-    assert len(result.map.points) == len(walk.map.points) + len(back.map.points)
+    # Points of both: the joint adjustment leaves out a few others than the adjustments of the two did.
+    assert len(result.map.points) == pytest.approx(len(walk.map.points) + len(back.map.points), rel=0.05)
     # A map of several recordings is extended as any other, but cannot be added to another one.
     assert len(dvo.load_map(out, new_recording=True).graph.recordings) == 2
     with pytest.raises(DvoError, match="holds 2 recordings.*Give it as the first map"):

@@ -20,6 +20,7 @@ from dvo.odometry.inertial.preintegration import integrated_turn, preintegrate, 
 from dvo.odometry.inertial.smoother import (
     GRAVITY,
     NODE,
+    SHIFT,
     STATE,
     Past,
     Similarities,
@@ -85,6 +86,8 @@ SURE_OFFSET, SURE_TURN = 3e-3, 0.5
 the rotation within a readout."""
 HELD = 0.05
 """Seconds for which the newest sample is held."""
+LEAD = 0.03
+"""Seconds of samples beyond the nodes, by which a time offset that is not known yet may change."""
 LONGEST_GAP = 0.02
 """Between samples that tell a rotation within a readout, seconds."""
 STILL = (0.02, 0.15)
@@ -258,7 +261,10 @@ class InertialEstimator:
         try:
             found = self._solved(problem, worlds)
         except _DisagreementError as disagreement:
-            self._refuse(str(disagreement), time)
+            offset = self._found_offset(nodes)
+            self._refuse(str(disagreement) + (f" ({1000 * offset:.0f} ms)" if abs(offset) > HELD else ""), time)
+            if offset and abs(offset) <= HELD:
+                self.first_offset, self._next = offset, time
             return
         except np.linalg.LinAlgError:
             found = None
@@ -566,14 +572,17 @@ class InertialEstimator:
             if turn is None:
                 return None, worlds, reason
         offset = self.first_offset if self.solution is None else self.solution.time_offset
-        lead = 0.03 + abs(offset)
-        kept = (nodes.times + lead <= samples.timestamps[-1] + 0.03) & (nodes.times - lead >= samples.timestamps[0])
+        # Where the sensor's clock is ahead, the newest sample is older than the newest frame.
+        times = nodes.times + offset
+        kept = (times <= samples.timestamps[-1] + HELD) & (times - LEAD >= samples.timestamps[0])
         if not kept.all():
             nodes, worlds = _chosen(nodes, worlds, kept)
         enough = self.options.first if not self.aligned else 2 * self.options.interval
         if len(nodes) < 3 or nodes.times[-1] - nodes.times[0] < enough:
             return None, worlds, "too few poses"
         near = samples.between(nodes.times[0] - 0.5, nodes.times[-1] + 0.5)
+        last = float(nodes.times[-1]) + offset + (0.0 if self.aligned else LEAD)
+        near = _held(near, min(last, float(samples.timestamps[-1]) + HELD))
         force = float(np.median(np.linalg.norm(near.accel, axis=1))) if len(near) else 0.0
         if not GRAVITY_RANGE[0] <= force <= GRAVITY_RANGE[1]:
             return None, worlds, f"the median specific force is {force:.3g} m/s^2 where gravity is 9.81: units, or axes"
@@ -599,6 +608,17 @@ class InertialEstimator:
         self._smoother = replace(self._smoother, extrinsic_sigma=FOUND_EXTRINSIC)
         self.history.append({"time": float(nodes.times[-1]), "event": "rotation between sensor and camera found"})
         return ""
+
+    def _found_offset(self, nodes: VisualNodes) -> float:
+        """Time offset by the rotations alone, where they tell another one than an alignment began with; 0 otherwise."""
+        samples, turn = self.stream.samples(), self.rotation_camera_imu
+        if self.history or samples is None or turn is None:  # an offset that another one follows is a clock that drifts
+            return 0.0
+        mine = nodes.of(int(nodes.segment[-1]))
+        near = samples.between(mine.times[0] - 1.0, mine.times[-1] + 1.0)
+        found = align_imu(mine.times, mine.rotation, near.timestamps, near.gyro, turn, fixed=True)
+        told = not found.reason and found.sigma_offset < SURE_OFFSET and found.residual < SURE_TURN
+        return found.time_offset if told and abs(found.time_offset - self.first_offset) > SHIFT else 0.0
 
     def _solved(self, problem: Smoother, worlds: list[int]) -> Smoothed | None:
         """The best solution from some starts."""
@@ -890,7 +910,7 @@ def _words(reason: str) -> str:
 def _held(samples: InertialSamples, until: float) -> InertialSamples:
     """Samples of which the newest is held until a time soon after it, as where the sensor's clock is ahead."""
     stamps = samples.timestamps
-    if not len(samples) or not 0 < until - stamps[-1] < HELD:
+    if not len(samples) or not 0 < until - stamps[-1] <= HELD:
         return samples
     gyro, accel = (np.concatenate([values, values[-1:]]) for values in (samples.gyro, samples.accel))
     return replace(samples, timestamps=np.append(stamps, until), gyro=gyro, accel=accel)

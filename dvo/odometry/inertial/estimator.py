@@ -72,6 +72,9 @@ MAX_ROTATION_FACTOR = 8.0
 """Factor of the noise of visual orientations above which samples and images do not fit."""
 MAX_SHIFT = 0.02
 """Change of the time offset since the alignment above which the clocks drift, seconds."""
+CLOCK_EVERY, CLOCK_SPAN, MAX_DRIFT = 4.0, 6.0, 1e-3
+"""Seconds between looks at the clock of the samples; of a segment that tells its drift; and drift, seconds a second,
+beyond three of its deviations, with which samples are no use."""
 MAX_BIASES = (0.15, 1.0)
 """Biases that no working sensor has, rad/s and m/s^2."""
 AGREEMENT = 0.03
@@ -188,6 +191,7 @@ class InertialEstimator:
         self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
         self._past: list[BodyState] = []  # states that were newest
         self._held = np.nan  # time of the node whose heading and position are held
+        self._drift, self._watched = "", -np.inf  # what is told of a clock that drifts; time of the last look at it
         self._smoother = SmootherOptions()
         self._known: list[int] = []  # worlds of the solution, in its order
 
@@ -254,6 +258,7 @@ class InertialEstimator:
         if self.solution is not None:  # the window begins with a node that is known
             known = np.isin(np.round(nodes.times, 6), np.round(self.solution.times, 6))
             nodes, worlds = _chosen(nodes, worlds, np.arange(len(nodes)) >= int(known.argmax()))
+        self._watch_clock(nodes, time)
         problem, worlds, doubt = self._problem(nodes, worlds)
         if problem is None:
             self._refuse(doubt, time)
@@ -262,7 +267,8 @@ class InertialEstimator:
             found = self._solved(problem, worlds)
         except _DisagreementError as disagreement:
             offset = self._found_offset(nodes)
-            self._refuse(str(disagreement) + (f" ({1000 * offset:.0f} ms)" if abs(offset) > HELD else ""), time)
+            told = f"; the rotations fit with an offset of {1000 * offset:.0f} ms" if abs(offset) > HELD else ""
+            self._refuse(f"{disagreement}{told}", time)
             if offset and abs(offset) <= HELD:
                 self.first_offset, self._next = offset, time
             return
@@ -564,6 +570,8 @@ class InertialEstimator:
     def _problem(self, nodes: VisualNodes, worlds: list[int]) -> tuple[Smoother | None, list[int], str]:
         """Problem of nodes that samples cover, and the worlds of its segments; None and why there is none."""
         samples, turn = self.stream.samples(), self.rotation_camera_imu
+        if self._drift:
+            return None, worlds, self._drift
         if samples is None or len(samples) < 2:
             return None, worlds, "too few samples"
         if turn is None:
@@ -609,16 +617,39 @@ class InertialEstimator:
         self.history.append({"time": float(nodes.times[-1]), "event": "rotation between sensor and camera found"})
         return ""
 
-    def _found_offset(self, nodes: VisualNodes) -> float:
-        """Time offset by the rotations alone, where they tell another one than an alignment began with; 0 otherwise."""
+    def _offset_by_turns(self, nodes: VisualNodes) -> tuple[float, float] | None:
+        """Time offset by the rotations of nodes of one segment alone, and its deviation; None: they do not tell it."""
         samples, turn = self.stream.samples(), self.rotation_camera_imu
-        if self.history or samples is None or turn is None:  # an offset that another one follows is a clock that drifts
-            return 0.0
+        if samples is None or turn is None:
+            return None
+        near = samples.between(nodes.times[0] - 1.0, nodes.times[-1] + 1.0)
+        found = align_imu(nodes.times, nodes.rotation, near.timestamps, near.gyro, turn, fixed=True)
+        if found.reason or found.sigma_offset > SURE_OFFSET or found.residual > SURE_TURN:
+            return None
+        return found.time_offset, found.sigma_offset
+
+    def _watch_clock(self, nodes: VisualNodes, time: float) -> None:
+        """Compare the time offsets of two halves of the newest segment now and then: a clock that drifts is no use."""
         mine = nodes.of(int(nodes.segment[-1]))
-        near = samples.between(mine.times[0] - 1.0, mine.times[-1] + 1.0)
-        found = align_imu(mine.times, mine.rotation, near.timestamps, near.gyro, turn, fixed=True)
-        told = not found.reason and found.sigma_offset < SURE_OFFSET and found.residual < SURE_TURN
-        return found.time_offset if told and abs(found.time_offset - self.first_offset) > SHIFT else 0.0
+        span = float(mine.times[-1] - mine.times[0])
+        if self._drift or time < self._watched + CLOCK_EVERY or span < CLOCK_SPAN:
+            return
+        self._watched, early = time, mine.times <= mine.times[0] + span / 2
+        halves = [self._offset_by_turns(mine.where(half)[0]) for half in (early, ~early)]
+        if halves[0] is None or halves[1] is None:
+            return
+        (before, sigma), (after, other) = halves
+        rate, known = 2 * (after - before) / span, 2 * float(np.hypot(sigma, other)) / span
+        if abs(rate) - 3 * known > MAX_DRIFT:
+            self._drift = f"the clock of the samples drifts by {1000 * rate:.1f} ms a second"
+            self._failures = FAILURES  # at once
+
+    def _found_offset(self, nodes: VisualNodes) -> float:
+        """Time offset by rotations, where they tell another one than an alignment began with; 0 otherwise."""
+        if self.history:  # an offset that another one follows is a clock that drifts
+            return 0.0
+        found = self._offset_by_turns(nodes.of(int(nodes.segment[-1])))
+        return 0.0 if found is None or abs(found[0] - self.first_offset) < SHIFT else found[0]
 
     def _solved(self, problem: Smoother, worlds: list[int]) -> Smoothed | None:
         """The best solution from some starts."""

@@ -139,7 +139,7 @@ def _poisoned(kind: str, recording: Recording) -> Recording:
 
 @pytest.mark.parametrize(
     ("kind", "word"),
-    [("g", "units"), ("degrees", "turn"), ("axes", "turn"), ("late", "turn"), ("dropped", "gyroscope")],
+    [("g", "units"), ("degrees", "turn"), ("axes", "turn"), ("late", "offset of 104 ms"), ("dropped", "gyroscope")],
 )
 def test_poisoned_samples_are_refused_with_the_reason(kind: str, word: str) -> None:
     estimator, reasons = drive(_poisoned(kind, record(3, seconds=6.0)))
@@ -553,3 +553,16 @@ def test_the_newest_pose_takes_part_in_the_estimate_whatever_the_time_offset(off
     error = state.velocity - turn @ truth
     assert np.linalg.norm(error) < 4 * np.sqrt(np.trace(state.covariance[6:9, 6:9])) + 0.02
     assert np.trace(state.covariance[6:9, 6:9]) < 0.1**2
+
+
+@pytest.mark.parametrize(("rate", "is_used"), [(3e-3, False), (-3e-3, False), (1e-4, True)])
+def test_a_clock_that_drifts_is_told_within_seconds_and_for_good(rate: float, is_used: bool) -> None:
+    recording = record(5, seconds=14.0)
+    recording = recording.with_samples(times=(1 + rate) * recording.samples.timestamps)
+    estimator = InertialEstimator(InertialOptions())
+    for time in recording.times:
+        feed(estimator, recording, time)
+        assert is_used or time < 11 or (not estimator.worlds and "drifts" in estimator.reason)
+    nodes = recording.nodes(0.0, 14.0)
+    assert (estimator.settle(nodes, [0]) is not None) == is_used
+    assert estimator.aligned == is_used

@@ -297,12 +297,12 @@ class InertialEstimator:
         Returns:
             A state for each time, with its covariance. A sensor that stands still does not move.
         """
-        samples = self.stream.samples()
-        assert samples is not None and self.solution is not None
+        assert self.solution is not None
         offset = self.solution.time_offset
+        samples = self.stream.near(start.time + offset - 0.5, times[-1] + offset + 0.5)
         found, state = [], start
         for time in times.tolist():
-            state = _step(state, time, offset, samples, self.noise)
+            state = state if samples is None else _step(state, time, offset, samples, self.noise)
             found.append(state)
         return found
 
@@ -408,13 +408,13 @@ class InertialEstimator:
         past = [state for state in self._past if state.time <= self._held + 1e-6]
         if not past:
             return found.covariance
-        state, up = past[-1], np.array([0.0, 0.0, 1.0])
+        state = past[-1]
         told = np.zeros((4, STATE))  # heading and position of that state
         told[0, :3], told[1:, 3:6] = state.rotation[2], np.eye(3)
         follows = np.zeros((len(found.covariance), 4))  # the newest state by these
         follows[:3, 0] = found.rotation[-1][2]
-        follows[3:6, 0] = np.cross(up, found.position[-1] - state.position)
-        follows[6:9, 0] = np.cross(up, found.velocity[-1])
+        (x, y, _), (u, v, _) = found.position[-1] - state.position, found.velocity[-1]
+        follows[3:9, 0] = -y, x, 0.0, -v, u, 0.0  # about the vertical
         follows[3:6, 1:] = np.eye(3)
         chain = follows @ told
         return found.covariance + chain @ state.covariance @ chain.T
@@ -873,7 +873,8 @@ class InertialEstimator:
         self._follow(found)
         state = self.last_state()
         assert state is not None
-        self._past.append(state)
+        before = [k for k, known in enumerate(self._past) if known.time <= self._held + 1e-6]
+        self._past = [*self._past[before[-1] if before else 0 :], state]  # those that are told of, now or later
         if found.past is not None:
             self._next = self._whole + BETWEEN
 

@@ -283,6 +283,7 @@ class Smoother:
     offset: float = 0.0
     held: int = 0
     past: Past | None = None
+    _haste: tuple[VisualNodes, Array] | None = field(default=None, init=False, repr=False)
 
     @property
     def segments(self) -> int:
@@ -292,16 +293,13 @@ class Smoother:
     @property
     def haste(self) -> Array:
         """``(N - 1,)`` factors of the noise of images between nodes, by the angular rate there."""
-        known = self.__dict__.get("_haste")
-        if known is None or known[0] is not self.nodes:
+        if self._haste is None or self._haste[0] is not self.nodes:
             times, stamps = self.nodes.times + self.offset, self.samples.timestamps
             rate = np.linalg.norm(self.samples.gyro - self.gyro_bias, axis=1)
             turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(stamps))])
             rates = np.diff(np.interp(times, stamps, turned)) / np.diff(times)
-            known = self.nodes, 1 + (rates / HASTE) ** 2
-            self.__dict__["_haste"] = known
-        factors: Array = known[1]
-        return factors
+            self._haste = self.nodes, 1 + (rates / HASTE) ** 2
+        return self._haste[1]
 
     def preintegrated(self, values: Values) -> Preintegration:
         """Samples between the nodes, with the present biases and time offset."""

@@ -182,15 +182,16 @@ class Map:
 
         Returns:
             By increasing identifier, dropped ones included; those whose patches have been released are left out, and
-            dropped ones whose anchor is not archived.
+            dropped ones that are relative to a keyframe of the window, also by way of others.
         """
-        return [
-            frame
-            for frame in self.archive
-            if self._shares_world(frame.identifier, segment)
-            and len(frame.inverse_depth)
-            and (frame.anchor is None or frame.anchor in self.archive)
-        ]
+        found: list[ArchivedKeyframe] = []
+        placed: set[int] = set()
+        for frame in self.archive:  # an anchor comes before those that are relative to it
+            if frame.anchor is None or frame.anchor in placed:
+                placed.add(frame.identifier)
+                if self._shares_world(frame.identifier, segment) and len(frame.inverse_depth):
+                    found.append(frame)
+        return found
 
     def _shares_world(self, identifier: int, segment: int) -> bool:
         own = self.segment_of(identifier)

@@ -139,6 +139,20 @@ def test_everything_that_left_is_a_problem_that_bundle_adjustment_can_take():
     assert len(graph.log.trajectory()) == 6
 
 
+def test_a_frame_whose_place_the_window_decides_is_no_member_yet():
+    """An aligned frame is relative to the newest keyframe, which is dropped later and then relative to another one."""
+    graph, poses = scene()
+    none = np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
+    graph.log.add(0.6).place(6, 0)
+    graph.attach(6, 0.6, poses[5].double().numpy(), *none)
+    graph.drop(5)
+    graph.archive_oldest()
+    assert [frame.identifier for frame in graph.members(0)] == graph.problem().identifiers.tolist() == [0]
+    while len(graph.window):
+        graph.archive_oldest()
+    assert graph.problem().identifiers.tolist() == [0, 1, 2, 3, 4, 5, 6]
+
+
 @pytest.mark.long
 def test_a_global_adjustment_of_the_archive_moves_frames_and_points_back():
     """Archived poses are disturbed; bundle adjustment of everything archived finds them again."""

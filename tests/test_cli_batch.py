@@ -449,6 +449,8 @@ def test_an_address_without_a_cluster_is_said_at_once(address, videos, tmp_path,
         assert main(line(videos, tmp_path / "out", "--ray", address, "--system", "klt-pnp")) == 2
     error = capsys.readouterr().err
     assert f"--ray: no Ray cluster at '{address}'" in error and "ray start --head" in error and not ray.asked
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    assert main(line(videos, tmp_path / "out", "--ray", "auto", "--system", "klt-pnp")) == 2 and not ray.asked
 
 
 def import_or(ray: PretendedRay) -> Callable[[str], object]:

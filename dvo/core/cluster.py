@@ -46,7 +46,8 @@ def connected(address: str, root: Path) -> Iterator[Any]:
         raise DvoError("Ray is not installed", field="--ray", remedy="pip install 'dvo[ray]'") from None
     _check_listens(address)
     path = os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))
-    options = {"runtime_env": {"env_vars": {"PYTHONPATH": path}}} if address == "local" else {}
+    own = {"runtime_env": {"env_vars": {"PYTHONPATH": path}}, "include_dashboard": False}
+    options: dict[str, Any] = own if address == "local" else {}
     try:
         ray.init(address=address, log_to_driver=False, **options)
     except (ConnectionError, ValueError, RuntimeError) as error:
@@ -59,6 +60,8 @@ def connected(address: str, root: Path) -> Iterator[Any]:
 
 def _check_listens(address: str) -> None:
     """Raise DvoError if nothing listens at a host and port, of which Ray asks again and again for many minutes."""
+    if address == "auto":
+        address = os.environ.get("RAY_ADDRESS", address)  # which Ray looks up first
     try:
         place = urlsplit(address if "://" in address else f"//{address}")
         if place.hostname and place.port:

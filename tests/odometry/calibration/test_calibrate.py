@@ -235,6 +235,13 @@ def test_what_is_hardly_possible_is_judged_after_the_last_step(leaning):
     assert leaning(0.5, replace(narrow, deviation=160 * 0.06))[0].focal == pytest.approx(200, rel=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("images", "focal"), [("tartanair_v1_60/image_left", 320), ("kitti00_120/image_0", 719)])
+def test_the_focal_length_of_a_real_clip_far_from_the_usual_one(data_root, images, focal):
+    found = calibrate(dvo.open(data_root / images, fps=10, guess=True))
+    assert found.found and found.focal == pytest.approx(focal, rel=0.05)
+
+
 def test_ignored_pixels_are_not_measured(clip):
     reasons = []
     hidden = [replace(frame, mask=np.zeros((144, 192), bool)) for frame in clip[:3]]

@@ -130,7 +130,7 @@ def read_table(path: Path, remedy: str, field: str | None = None) -> Table:
 
 def _is_header(fields: Sequence[str]) -> bool:
     """True for words alone; ``nan`` and numbers out of bounds are none."""
-    return not any(is_number(field) for field in fields) and parse_date(" ".join(fields[:2])) is None
+    return not any(is_number(field) for field in fields) and parse_date(" ".join(fields)) is None
 
 
 def parse_time(text: str) -> int | float:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.clock import clock_of_names, clock_of_rows, read_table
+from dvo.core.text import visible
+from dvo.data.files.clock import Table, clock_of_names, clock_of_rows, is_number, read_table
 from dvo.data.files.files import MAX_NUMBER, is_file
 
 NOMINAL_FPS = 30.0
@@ -19,24 +21,31 @@ RATES = (1e-5, 1e6)
 _SHORTEST = 2e-5  # seconds between the images of a list
 
 
-def read_times(path: Path, count: int | None, notes: list[str] | None = None) -> np.ndarray:
+def read_times(
+    path: Path, count: int | None, notes: list[str] | None = None, images: Sequence[Path] = ()
+) -> np.ndarray:
     """Read the times of a text or CSV file, one row per image: see :func:`dvo.data.files.clock.clock_of_rows`.
 
-    ``#`` starts a comment; a first row of words is a header.
+    ``#`` starts a comment; a first row of words is a header. Rows that name images are those of these images, whatever
+    their order; of images that are not there they are left out, and a note says so.
 
     Args:
         path: the file.
         count: number of rows that there must be; None for any.
         notes: receives a sentence if the times are no plain seconds.
+        images: that rows may name.
 
     Returns:
-        ``(N,)`` float64 seconds, strictly increasing.
+        ``(N,)`` float64 seconds, strictly increasing unless rows name the images.
 
     Raises:
         DvoError: missing or malformed file, no number where one is expected or one beyond
             :data:`dvo.data.files.files.MAX_NUMBER`, another number of rows, times that do not increase.
     """
     table = read_table(path, "give a file with one time per image", "times")
+    named = _named(table, images)
+    if named is not None:
+        return _times_by_name(*named, path, images, notes)
     clock = clock_of_rows(table.rows, table.header)
     times = clock.seconds
     for row, value in enumerate(times.tolist()):
@@ -69,6 +78,77 @@ def read_times(path: Path, count: int | None, notes: list[str] | None = None) ->
     if note is not None and notes is not None:
         notes.append(f"{note} (a header such as 'time [s]' says what they are)")
     return times
+
+
+def _named(table: Table, images: Sequence[Path]) -> tuple[Table, list[str]] | None:
+    """The table without the column that names images, and that column; None if there is none.
+
+    Numbers are names only if all images have one of them, beside another column.
+    """
+    width = min(map(len, table.rows), default=0)
+    known = {image.name for image in images} | {image.stem for image in images if not image.stem.isdecimal()}
+    numbers = {int(image.stem) if image.stem.isdecimal() else -1 for image in images}
+    for k in range(width if width > 1 and images else 0):
+        names = [PureWindowsPath(row[k]).name for row in table.rows]
+        if all(name.isdecimal() and len(name) < 19 for name in names):
+            names = [str(int(name)) for name in names]
+            is_named = numbers <= set(map(int, names))
+        else:
+            found = [name for name in names if name in known and not is_number(name)]
+            is_named = 2 * len(set(found)) >= len(images)
+        if is_named and len(set(names)) == len(names):
+            rows = [[*row[:k], *row[k + 1 :]] for row in table.rows]
+            header = table.header
+            header = [*header[:k], *header[k + 1 :]] if header and len(header) == len(table.rows[0]) else None
+            return replace(table, rows=rows, header=header), names
+    return None
+
+
+def _times_by_name(
+    table: Table, names: list[str], path: Path, images: Sequence[Path], notes: list[str] | None
+) -> np.ndarray:
+    rows = dict(zip(names, range(len(names)), strict=True))
+    places = [
+        next((rows[key] for key in (image.name, image.stem, _number(image.stem)) if key in rows), None)
+        for image in images
+    ]
+    missing = [visible(image.name) for image, place in zip(images, places, strict=True) if place is None]
+    if missing:
+        shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
+        raise DvoError(f"no row for {shown}", file=path, field="times", remedy="give a row for each image")
+    order = sorted(range(len(names)), key=lambda row: _first_number(table.rows[row]))
+    clock = clock_of_rows([table.rows[row] for row in order], table.header)
+    seconds = np.empty(len(names))
+    seconds[order] = clock.seconds
+    bad = next((row for row in order if not abs(seconds[row]) <= MAX_NUMBER), None)  # NaN fails too
+    if bad is not None:
+        raise DvoError("no time beside the name", file=path, field=f"line {table.lines[bad]}",
+                       remedy="give a name and seconds in each row")  # fmt: skip
+    found = seconds[np.array(places, dtype=np.int64)]
+    if notes is not None:
+        if len(names) > len(images):
+            notes.append(f"{len(names) - len(images)} of the {len(names)} rows of {path} name images that are not there")
+        notes += filter(None, [replace(clock, column=0).note(str(path))])
+    return found
+
+
+def _number(stem: str) -> str:
+    return str(int(stem)) if stem.isdecimal() and len(stem) < 19 else stem
+
+
+def _first_number(row: Sequence[str]) -> float:
+    return next((float(field) for field in row if is_number(field)), 0.0)
+
+
+def in_order(images: list[Path], times: np.ndarray) -> tuple[list[Path], np.ndarray]:
+    """Images in the order of their times, which a list that names them may state in another one than their names.
+
+    Args:
+        images: ``N`` files.
+        times: ``(N,)`` seconds.
+    """
+    order = np.argsort(times, kind="stable")
+    return [images[k] for k in order], times[order]
 
 
 def times_from_names(paths: list[Path], notes: list[str] | None = None) -> np.ndarray | None:
@@ -143,22 +223,23 @@ def choose_times(
         fallback: times that the data set offers, e.g. those of its ground truth.
 
     Returns:
-        ``(len(paths),)`` float64 seconds; may hold duplicates when they come from names.
+        ``(len(paths),)`` float64 seconds; may hold duplicates when they come from names, and in another order than
+        ``paths`` when a list names these (:func:`in_order`).
 
     Raises:
         DvoError: see :func:`read_times`; a rate that is not positive.
     """
     fps = checked_rate(fps)
     if times is not None:
-        return read_times(times, len(paths), warnings)
+        return read_times(times, len(paths), warnings, paths)
     found, origin = None, ""
     beside = _beside(folder, "times.txt")
     if beside is not None:
-        found, origin = read_times(beside, len(paths), warnings), str(beside)
+        found, origin = read_times(beside, len(paths), warnings, paths), str(beside)
     if found is None:
         found, origin = times_from_names(paths, warnings), "the file names"
     if found is None and (beside := _beside(folder, "timestamps.txt")) is not None:
-        found, origin = read_times(beside, len(paths), warnings), str(beside)
+        found, origin = read_times(beside, len(paths), warnings, paths), str(beside)
     if found is None:
         found, origin = fallback(), "the ground truth"
     if found is not None:

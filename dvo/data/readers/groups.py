@@ -119,7 +119,8 @@ def _odd_names(images: Sequence[Path]) -> str | None:
 def _begun_anew(images: Sequence[Path]) -> str | None:
     """Note about names of several recordings, ``take1_0001.png`` and ``take2_0001.png``."""
     fields = [re.findall(r"[0-9]+", image.stem) for image in images]
-    if len({re.sub(r"[0-9]+", "*", image.stem) for image in images}) != 1 or len(fields[0]) != 2:
+    shapes = {re.sub(r"[0-9]+", "*", image.stem) for image in images}
+    if len(shapes) != 1 or len(fields[0]) != 2 or "*.*" in shapes.pop():  # a number with a decimal point
         return None
     starts = [k for k in range(1, len(fields)) if fields[k][0] != fields[k - 1][0]]
     blocks = [fields[start:end] for start, end in pairwise([0, *starts, len(fields)])]

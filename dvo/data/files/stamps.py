@@ -127,7 +127,8 @@ def _times_by_name(
     found = seconds[np.array(places, dtype=np.int64)]
     if notes is not None:
         if len(names) > len(images):
-            notes.append(f"{len(names) - len(images)} of the {len(names)} rows of {path} name images that are not there")
+            others = f"{len(names) - len(images)} of the {len(names)} rows"
+            notes.append(f"{others} of {path} name images that are not there")
         notes += filter(None, [replace(clock, column=0).note(str(path))])
     return found
 

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 # A damaged packet fails one grab, and the packets after it may be good; the end of the file fails every grab.
 # Half a minute of 30 Hz video without a frame is taken for the end.
 _GIVE_UP_AFTER = 900
+_LATE = 3  # frames in a row that show that a clock was set back, as of parts put together
 _JUMP = 5000.0  # milliseconds: frames in another order than that of their times lie far less apart
 _HELD_BACK = 4  # frames that a codec needs before it gives the first one
 _BINARY = re.compile(rb"[^\t\n\r\x0c\x20-\x7e\x80-\xff]")
@@ -356,16 +357,21 @@ class VideoRecording:
         import cv2
 
         read, last, previous, dropped, offset = 0, 0.0, -np.inf, 0, 0.0
+        latest, late = 0.0, 0  # milliseconds of the file; frames in a row that increase, but behind an earlier one
 
         def grabbed(capture: cv2.VideoCapture) -> Iterator[tuple[int, float]]:
-            nonlocal read, last, offset
+            nonlocal read, last, offset, latest, late
             for index, milliseconds, failed in _grabs(capture):
                 log.unreadable.extend(f"frame {number}" for number in range(index - failed, index))
-                if self._use_container and milliseconds + offset < last - _JUMP:
-                    offset = last + 1000 / self._fps - milliseconds
+                ahead = milliseconds + offset
+                late = 0 if ahead > last else late + 1 if milliseconds > latest or not late else 1
+                latest = milliseconds
+                if self._use_container and (ahead < last - _JUMP or late == _LATE):
+                    ahead, late = last + 1000 / self._fps, 0
+                    offset = ahead - milliseconds
                     log.notes.append(f"the clock was set back before frame {index}: times go on from there")
-                read, last = read + 1, milliseconds + offset
-                yield index, last
+                read, last = read + 1, max(last, ahead)
+                yield index, ahead
 
         with _capture(self.path) as capture:
             for index, milliseconds in selection.interval.select(
@@ -375,7 +381,7 @@ class VideoRecording:
                 if timestamp is None or not previous < timestamp < np.inf:  # NaN fails too
                     dropped += 1
                     if dropped == 1:
-                        log.notes.append(f"from frame {index} on, frames not later than the one before were dropped")
+                        log.notes.append(f"frames not later than the one before were dropped, the first is frame {index}")
                     continue
                 decoded, image = capture.retrieve()
                 if not decoded or image is None:

@@ -201,6 +201,16 @@ def test_parts_with_clocks_of_their_own(make, monkeypatch):
     assert any("clock was set back before frame 12" in text for text in source.warnings)
 
 
+def test_short_parts_with_clocks_of_their_own(make, monkeypatch):
+    """Three frames in a row that are late show it; single ones, in another order than that of their times, do not."""
+    milliseconds = [*range(0, 400, 40), 390, 400, 420, 410, *range(440, 600, 40), *range(0, 400, 40)]
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: StampsLike(milliseconds))
+    source = open_source(make.video("a.avi", "MJPG", frames=2), calib=make.text("c.txt", "50 50 31.5 23.5"))
+    stamps = [frame.timestamp for frame in source]
+    assert len(stamps) == len(milliseconds) - 3 and (np.diff(stamps) > 0).all() and max(np.diff(stamps)) < 0.05
+    assert any("clock was set back before frame 20" in text for text in source.warnings)
+
+
 @pytest.mark.parametrize(("content", "what"), [
     (b"frame000.png\nframe001.png\n", "a text file"), (b"PK\x03\x04" + bytes(40), "an archive"), (b"", "an empty file"),
     (b"ffconcat version 1.0\nfile clip.mp4\n", "a text file"), (b"\xef\xbb\xbf#EXTM3U\n#\0\n", "a text file"),

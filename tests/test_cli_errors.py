@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -157,6 +158,18 @@ def test_groundtruth_that_is_none(image_folder, tmp_path, capsys):
 )
 def test_bad_options(image_folder, tmp_path, capsys, options):
     error_of(["run", str(image_folder), "--calib", calibration(tmp_path), *options], tmp_path, capsys)
+
+
+@pytest.mark.parametrize("spelling", ["{}", "{}/../images", "{}/.."])
+def test_results_among_the_images(image_folder, tmp_path, capsys, spelling):
+    """Their pictures would be images of the sequence the next time."""
+    clip = shutil.copytree(image_folder, tmp_path / "own" / "images")
+    source = clip.parent if spelling.endswith("..") else clip
+    line = ["run", str(source), "--calib", str(image_folder.parent / "calib.txt"), "--fps", "10"]
+    assert main([*line, "--out", spelling.format(clip)]) == 2
+    assert "among which the pictures of the results would be read" in capsys.readouterr().err
+    assert sorted(clip.iterdir()) == sorted(clip / file.name for file in image_folder.iterdir())
+    assert main([*line, "--out", str(clip / "results")]) == 0
 
 
 def test_out_that_is_a_file(image_folder, tmp_path, capsys):

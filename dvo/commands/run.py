@@ -23,7 +23,7 @@ from dvo.commands.input_options import input_facts, input_settings, print_input
 from dvo.commands.maps import load_in_map
 from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
-from dvo.commands.places import check_outputs
+from dvo.commands.places import check_apart, check_outputs
 from dvo.commands.report import Scores, describe_seconds, headline, print_report, score
 from dvo.commands.request import request_facts
 from dvo.commands.run_options import INPUTS
@@ -162,6 +162,7 @@ def _check_outputs(arguments: argparse.Namespace, folder: Path, source: Source) 
     outputs = {"--save-map": arguments.save_map, "--overlay": arguments.overlay, "--rerun": arguments.rerun}
     inputs = {f"--{name.replace('_', '-')}": getattr(arguments, name) for name in INPUTS}
     check_outputs(outputs, inputs, arguments.source, folder)
+    check_apart(folder, arguments.source, source.recording.images)
     found = {"the samples": getattr(source.reading.inertial, "file", None)}  # beside the source
     if source.calibration is not None:
         found["the calibration"] = source.calibration.file

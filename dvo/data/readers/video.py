@@ -381,7 +381,7 @@ class VideoRecording:
                 if timestamp is None or not previous < timestamp < np.inf:  # NaN fails too
                     dropped += 1
                     if dropped == 1:
-                        log.notes.append(f"frames not later than the one before were dropped, the first is frame {index}")
+                        log.notes.append(f"frames not later than the one before were dropped, first frame {index}")
                     continue
                 decoded, image = capture.retrieve()
                 if not decoded or image is None:

@@ -43,9 +43,9 @@ def checked_frame(frame: Frame) -> Frame:
 
     Raises:
         DvoError: an object that is not a frame; an index that is not a whole number; a time that is not a finite
-            number, or above 1e12; an interruption that is no text, or a silence that is no number of seconds; an image of another
-            form or type, without pixels, or with values not finite or out of range; no camera, or one of another
-            image size; a mask of another type or size. Names the frame and the field.
+            number, or above 1e12; an interruption that is no text, or a silence that is no number of seconds; an image
+            of another form or type, without pixels, or with values not finite or out of range; no camera, or one of
+            another image size; a mask of another type or size. Names the frame and the field.
 
     Example:
         >>> import numpy as np

@@ -153,7 +153,7 @@ def open_source(
     guessed = None
     if calibration is None:
         if not guess:
-            raise no_calibration(path, recording.warnings)
+            raise no_calibration(path, width, height, recording.warnings)
         guessed = guess_focal(recording.images[0] if recording.images else path, width, height)
         calibration = guessed.calibration
     doubts = calibration.doubts(width, height)

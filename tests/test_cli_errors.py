@@ -83,6 +83,12 @@ def test_missing_source(tmp_path, capsys):
     assert "nowhere.mp4" in error_of(["run", str(tmp_path / "nowhere.mp4")], tmp_path, capsys)
 
 
+def test_an_empty_source_is_not_the_working_directory(image_folder, tmp_path, capsys, monkeypatch):
+    """As of a variable of a script that is not set."""
+    monkeypatch.chdir(image_folder)
+    assert "source: an empty text" in error_of(["run", ""], tmp_path, capsys)
+
+
 def test_calibration_file_missing(image_folder, tmp_path, capsys):
     assert "gone.txt" in error_of(["run", str(image_folder), "--calib", "gone.txt"], tmp_path, capsys)
 

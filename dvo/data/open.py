@@ -122,6 +122,8 @@ def open_source(
         return open_stream(source, **options, mask=mask, mask_invert=mask_invert)
     if queue is not None:
         raise DvoError("frames of a recording do not wait", field="queue", remedy="leave it out")
+    if source == "":
+        raise DvoError("an empty text", field="source", remedy="give a video, a folder of images or a sequence")
     path, topic = split_topic(source, topic)
     with lookups(path):
         is_there = path.exists()
@@ -181,6 +183,9 @@ def open_source(
     size, masks = (width, height), None
     if mask is not None:
         masks = open_masks(locate(mask, path, "mask"), recording, size, mask_invert, reduction)
+        if len(masks.files) == 1 and masks(0, None).all():
+            name = visible(masks.files[0].name)
+            doubts.append(f"the mask {name} ignores no pixel: those that are black (0) would be")
     truth = recording.groundtruth
     if request.groundtruth is not None:
         truth = read_groundtruth(request.groundtruth, recording.timestamps, doubts)

@@ -26,4 +26,4 @@ def replace_tracking(monkeypatch, track, profile):
     monkeypatch.setattr(calibrate, "load", lambda *_, **__: odometry)
     monkeypatch.setattr(calibrate, "closed_graph", lambda _: SimpleNamespace(members=lambda segment: range(60)))
     monkeypatch.setattr(calibrate, "adjust_segments", lambda *_: {"readout": 0.0})
-    monkeypatch.setattr(calibrate, "find_focal", lambda *_: profile())
+    monkeypatch.setattr(calibrate, "find_focal", lambda *_, **__: profile())

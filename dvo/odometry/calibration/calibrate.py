@@ -4,7 +4,7 @@ The beginning of a clip is tracked with a guess of the focal length, which is th
 (:mod:`dvo.odometry.global_ba.focal_length`); measurements made with a focal length far off are worse ones, so this is
 repeated with what was found, as long as no more frames are tracked than the clip has, and a few. The motion may not
 tell the focal length; then the guess is kept, and the result says so. The principal point is the middle of the image,
-unless the measurements tell it closely.
+and the lens has no distortion, unless the measurements tell them closely.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ from dvo.core.settings import check_settings
 from dvo.data.calibration.focal_guess import FocalGuess, guess_from_angle
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
-from dvo.odometry.calibration.camera_estimate import SELF_CALIBRATED, SelfCalibration, pinhole
+from dvo.geometry.camera import Camera
+from dvo.geometry.undistort import Undistorter
+from dvo.odometry.calibration.camera_estimate import SELF_CALIBRATED, SelfCalibration, simple_camera
 from dvo.odometry.frames.fixed_pixels import Bars
 from dvo.odometry.global_ba.focal_length import FocalProfile, find_focal
 from dvo.odometry.global_ba.self_calibration import adjust_segments
@@ -65,7 +67,8 @@ class CalibrationOptions:
             known any number.
         interval: seconds between frames, at least; of a faster camera frames are left out.
         settled: change of the logarithm of the focal length in a round below which it has settled; the principal point
-            has, once it moves by less than ``max_aside``.
+            has, once it moves by less than ``max_aside``, and the bend of the lens, once it changes by less than twice
+            this.
         min_contrast: increase of the cost at focal lengths a fifth off below which the motion does not tell.
         max_deviation: largest standard deviation of the logarithm of the focal length that is believed.
         inflation: factor of the standard deviation that the curvature of the cost gives; measurements of a patch in
@@ -106,7 +109,7 @@ def calibrate(
     on_frame: Callable[[Frame, Estimate | None], None] | None = None,
     on_round: Callable[[int, int, int], None] | None = None,
 ) -> SelfCalibration:
-    """Estimate the focal length of the camera that has recorded a clip.
+    """Estimate the camera that has recorded a clip: its focal length, barrel distortion and principal point.
 
     Args:
         frames: from the beginning of the clip: a :class:`dvo.data.Source`, or a list. Their cameras are not used, but
@@ -120,7 +123,8 @@ def calibrate(
             frames that it tracks if none is left out or lost.
 
     Returns:
-        The focal length with its standard deviation, or the guess if the images do not tell.
+        The focal length with its standard deviation, and the distortion of the lens if it has some, or the guess if the
+        images do not tell.
 
     Raises:
         DvoError: no frames, or weights of another architecture.
@@ -152,7 +156,7 @@ def calibrate(
         aside = aside[0] + picture.aside[0], aside[1] + picture.aside[1]
         return SelfCalibration(focal, deviation, source, width, height, count, reason, guess, aside, *more)
 
-    focal, aside, wanted, reason, count = guess.focal, (0.0, 0.0), options.frames, "", 0
+    focal, aside, bend, wanted, reason, count = guess.focal, (0.0, 0.0), 0.0, options.frames, "", 0
     walk: list[tuple[float, float]] = []
     known = length_hint(frames, -1)  # a source may not know it before it is read
     length = known if known >= 0 else None
@@ -165,9 +169,9 @@ def calibrate(
             clip = islice(_readable(frames if kept is None else copy(kept)), limit)
             x, y = (value * first.camera.width / width for value in aside)
             odometry = _loaded(weights, device, seed)
-            tracking = _Tracking(odometry, clip, focal * first.camera.width / width, (x, y), picture)
+            tracking = _Tracking(odometry, clip, focal * first.camera.width / width, (x, y), bend, picture)
         left -= tracking.go_on(wanted, options.interval, left, on_frame)
-        profile, count = _profile(tracking.odometry)
+        profile, count = _profile(tracking.odometry, tracking.lens)
         asked = [*walk, (math.log(focal), profile.minimum.value)]
         slope = _slope(asked)
         step = profile.minimum.value / slope
@@ -179,16 +183,24 @@ def calibrate(
                 break
             if walk:  # back to the guess; tracked with it, the clip goes on from where it is
                 tracking = None
-            focal, aside, wanted, walk = guess.focal, (0.0, 0.0), 2 * wanted, []
+            focal, aside, bend, wanted, walk = guess.focal, (0.0, 0.0), 0.0, 2 * wanted, []
             continue
         tracking, walk = None, asked
         before, (aside, unsure) = aside, _principal_point(profile, aside, focal, max(width, height), options)
         focal *= math.exp(step)
+        bent, bend = profile.bend.value - bend, profile.bend.value
+        bend_deviation = math.hypot(options.inflation * profile.bend.deviation, bent) if bend else math.inf
         if abs(step) > options.settled:  # the last round may end without having settled
             deviation = math.hypot(deviation, step)
-        is_settled = abs(step) <= options.settled and math.dist(before, aside) <= options.max_aside * max(width, height)
+        is_settled = (
+            abs(step) <= options.settled
+            and abs(bent) <= 2 * options.settled
+            and math.dist(before, aside) <= options.max_aside * max(width, height)
+        )
         if is_settled or is_last:
-            return result(focal, deviation * focal, SELF_CALIBRATED, count, "", guess, aside, unsure)
+            return result(
+                focal, deviation * focal, SELF_CALIBRATED, count, "", guess, aside, unsure, bend, bend_deviation
+            )
     return result(guess.focal, guess.deviation, guess.source, count, reason, guess)
 
 
@@ -252,7 +264,11 @@ class _Picture:
 
 
 class _Tracking:
-    """Tracking of the beginning of a clip with a focal length."""
+    """Tracking of the beginning of a clip with a focal length.
+
+    Attributes:
+        lens: that the images were undistorted from; None without distortion.
+    """
 
     def __init__(
         self,
@@ -260,10 +276,13 @@ class _Tracking:
         frames: Iterable[Frame],
         focal: float,
         aside: tuple[float, float],
+        bend: float,
         picture: _Picture,
     ) -> None:
-        self.odometry, self.frames, self.focal, self.aside = odometry, iter(frames), focal, aside
+        self.odometry, self.frames, self.focal, self.aside, self.bend = odometry, iter(frames), focal, aside, bend
         self.inside = picture.inside
+        self.lens: Camera | None = None
+        self._undistorter: Undistorter | None = None
         self.tracked, self.last = 0, -math.inf
 
     def go_on(
@@ -281,8 +300,13 @@ class _Tracking:
             image = frame.image[self.inside]
             mask = None if frame.mask is None else frame.mask[self.inside]
             self.last, (height, width) = frame.timestamp, image.shape[:2]
-            pixels = replace(pinhole(self.focal, self.aside, width, height), readout=frame.camera.readout)
-            camera = pixels.camera(width, height)
+            found = simple_camera(self.focal, self.aside, self.bend, width, height)
+            camera = replace(found, readout=frame.camera.readout).camera(width, height)
+            if self.bend:
+                if self._undistorter is None or self._undistorter.source != camera:
+                    self._undistorter, self.lens = Undistorter(camera), camera
+                camera, image = self._undistorter.camera, self._undistorter(image)
+                mask = None if mask is None else self._undistorter.mask(mask)
             estimate = self.odometry.track(Frame(frame.index, frame.timestamp, image, camera, mask=mask))
             if on_frame is not None:
                 on_frame(frame, estimate)
@@ -303,14 +327,14 @@ def _loaded(weights: str, device: torch.device | str, seed: int) -> PatchOdometr
 
 
 @torch.inference_mode()
-def _profile(odometry: PatchOdometry) -> tuple[FocalProfile, int]:
+def _profile(odometry: PatchOdometry, lens: Camera | None) -> tuple[FocalProfile, int]:
     """Profile of the longest segment so far, and its number of frames."""
     state, config = odometry.state, odometry.config
     graph = closed_graph(odometry)
     info = adjust_segments(graph, state.adjustable, state.shutter, config.estimate_readout, config.adjustment)
     longest = max(state.adjustable or [0], key=lambda segment: len(graph.members(segment)))
     shutter = replace(state.shutter, readout=float(info["readout"]))
-    return find_focal(graph, longest, shutter, config.adjustment), len(graph.members(longest))
+    return find_focal(graph, longest, shutter, config.adjustment, lens=lens), len(graph.members(longest))
 
 
 def _principal_point(

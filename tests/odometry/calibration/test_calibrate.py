@@ -11,6 +11,7 @@ import dvo
 from dvo.core.errors import DvoError
 from dvo.data import read_calibration
 from dvo.data.calibration.focal_guess import FocalGuess, guess_from_angle
+from dvo.geometry.undistort import Undistorter
 from dvo.odometry.calibration.calibrate import CalibrationOptions, calibrate
 from dvo.odometry.calibration.camera_estimate import SelfCalibration
 from dvo.odometry.global_ba.focal_length import FocalProfile
@@ -72,6 +73,28 @@ def test_without_its_deviation_the_principal_point_is_the_middle(leaning):
     assert far.found and far.aside == (0.0, 0.0), "22 of 192 pixels are hardly possible"
     found, tracked = leaning(1.0, guess, aside=(sure, unsure), max_aside=0.0)
     assert found.aside == (0.0, 0.0) and len(str(found).splitlines()) == 1 and len(tracked) == 1
+
+
+def test_the_distortion_that_was_found_is_taken_from_the_images_of_the_next_round(clip, monkeypatch, tmp_path):
+    tracked = []
+
+    def track(frame):
+        tracked.append(frame)
+        return Estimate(frame.timestamp, None, Status.TRACKING)
+
+    bent = FocalProfile(Minimum(0.0, 0.01, 0.5), 0.5, FLAT, Minimum(0.4, 0.01, 0.5))
+    replace_tracking(monkeypatch, track, lambda: bent)
+    frames = [replace(frame, mask=np.ones((144, 192), bool)) for frame in clip]
+    options = CalibrationOptions(frames=30, spare=1000)
+    found = calibrate(frames, FocalGuess(100.0, 40.0, "prior", 192, 144), options=options)
+    assert len(tracked) == 60 and (found.bend, found.bend_deviation) == (0.4, pytest.approx(0.03))
+    undistorter = Undistorter(dvo.Camera(100.0, 100.0, 95.5, 71.5, 192, 144, "eucm", (0.4, 1.0)))
+    assert tracked[0].camera.intrinsics[0] == 100 and np.array_equal(tracked[0].image, clip[0].image)
+    assert tracked[30].camera == undistorter.camera and tracked[30].mask.shape == (144, 192)
+    assert np.array_equal(tracked[30].image, undistorter(clip[0].image))
+    assert str(found).splitlines()[1] == "barrel distortion: eucm, alpha 0.40 +- 0.03, beta 1"
+    assert found.write(tmp_path / "calib.txt")
+    assert read_calibration(tmp_path / "calib.txt").camera(192, 144) == found.calibration.camera(192, 144)
 
 
 @pytest.mark.slow

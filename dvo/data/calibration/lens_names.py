@@ -156,6 +156,8 @@ def looks_like_a_lens(key: str, value: Any) -> bool:
     if _WORDS.search(name) or name in _WHOLE or bare(name) in _WHOLE or "dist" in parts or "dist" in parts[-1][:4]:
         return True
     numbers = _flat(value)
+    if name in ("k", "ks", "p", "ps") and isinstance(value, list) and numbers is not None:  # no matrix
+        return len(numbers) <= (6 if name[0] == "k" else 2)
     if numbers is not None and len(numbers) <= 3:
         return _SCALAR.fullmatch(name) is not None
     return numbers is not None and len(numbers) in (4, 5, 8, 12, 14) and not _BENIGN.search(name)

@@ -51,7 +51,9 @@ _TANGENTIAL = tuple(name.replace("radial", "tangential") for name in _RADIAL)
 _FISHEYE_FLAGS = ("fisheyemodel", "isfisheye", "fisheye", "usefisheye", "bfisheye")
 _RADTAN_FLAT = LENSES["radtan"].names
 _FIRST = ("cam0", "camera0", "camera", "camera1", "left", "leftcamera", "cameraleft", "camleft", "0", "l", "1", "color",
-          "colour", "rgb", "rgbcamera", "cam", "cam1", "camleftrect", "leftcam", "00", "02")  # fmt: skip
+          "colour", "rgb", "rgbcamera", "colorcamera", "colourcamera", "cameracolor", "camerargb", "colorintrinsics",
+          "rgbintrinsics", "colorcam", "rgbcam", "colorsensor", "rgbsensor", "cam", "cam1", "camleftrect", "leftcam",
+          "00", "02")  # fmt: skip
 _IF_ZERO = ("inversebrownconrady", "modifiedbrownconrady")  # RealSense: models without coefficients as a rule
 _SENSORS = frozenset(["gray", "grey", "rgb", "color", "colour", "mono", "monocular", "stereo", "graydepth", "rgbdepth",
                       "rgbd", "usb", "csi", "global", "rolling", "globalshutter", "rollingshutter"])  # fmt: skip
@@ -67,6 +69,7 @@ _BRACE = re.compile(r'\s*\{\s*"')
 _PAIRED = re.compile(r"(k|m|(?:camera_?)?matrix|camera_?mat|mtx|intrinsics?)_?(left|right|l|r|[0-2]|0[0-3])")
 _REGION = ("x_offset", "y_offset", "width", "height")
 _RECORDED = re.compile(r"^(?:original|orig|raw|distorted)|(?:original|orig|raw|(?<!un)distorted)$")
+_OF_OTHERS = re.compile(r"depth|infrared|(?<![a-z])ir(?![a-z])|thermal|(?<![a-z])tof(?![a-z])", re.IGNORECASE)
 _SUFFIX = re.compile(r"(.+?)_?(left|right|l|r|[0-2]|0[0-3])")
 _LED = re.compile(r"(left|right|cam(?:era)?_?[0-3])_(k|(?:camera_?)?matrix|camera_?mat|mtx|intrinsics?)")
 
@@ -123,6 +126,10 @@ def from_values(data: Any, path: Path, camera: int | None = None) -> Calibration
         raise DvoError("no keys in it", file=path, field="intrinsics", remedy=EXPECTED)
     found = [fields.cameras(_split(document), path) for document in mappings]
     read = [_calibration(_choose(named, camera, path), path) for named in found if named]
+    only = [named[0][0] for named in found if len(named) == 1]
+    if len(read) == 1 and camera is None and only and (kind := _OF_OTHERS.search(only[0])):
+        note = f"the only camera in it is {only[0]}: is that the camera of the images, or of {kind[0].lower()}?"
+        read = [replace(read[0], notes=(*read[0].notes, note))]
     if not read:
         raise DvoError(_missing(mappings), file=path, field="intrinsics", remedy=EXPECTED)
     if any(other != read[0] for other in read[1:]):
@@ -231,7 +238,10 @@ def _calibration(entries: Entries, path: Path) -> Calibration:
         _refuse_skew(float(skew.ravel()[0]), 1.0, path, "skew")
     if model != "none":
         told = entries.entry("distorted", "isdistorted", "hasdistortion")
-        if told is not None and says_nothing(told.value):
+        other = entries.entry("undistorted", "isundistorted", "rectified", "isrectified")
+        if other is not None and is_flag(other.value) and not says_nothing(other.value):
+            told = other
+        if told is not None and (told is other or says_nothing(told.value)):
             message = f"{str(told.value).lower()}, but there are coefficients of a lens"
             raise DvoError(message, file=path, field=told.name, remedy="leave what is true of the images")
         matrix = next((one for one in entries.found if one.used and "newcameramatrix" in one.calls), None)

@@ -696,6 +696,8 @@ READ = [
      f"right_dist_coeffs: {list(KC)}\n", NUMBERS, "radtan", FIVE, (None, None)),
     ("led.json", json.dumps({"cam0_K": json.loads(ROWS), "cam0_D": FIVE, "cam1_K": np.eye(3).tolist(), "cam1_D": KC}),
      NUMBERS, "radtan", FIVE, (None, None)),
+    ("azure.yaml", f"depth_camera: {{K: {MATRIX.replace('500', '400')}}}\ncolor_camera: {{K: {MATRIX}}}\n", NUMBERS,
+     "none", (), (None, None)),
     ("camera.ini", "; made by someone\n[camera]\nfx = 500\nfy = 510 ; pixels\ncx = 320\ncy = 240\nk1 = 0.1\nk2 = -0.2\n"
      "p1 = 0.003\np2 = 0.004\n[other]\nname\n", NUMBERS, "radtan", KC, (None, None)),
     ("camera.cfg", f"[intrinsics]\ncamera_matrix = {ROWS}\n[distortion]\ncoefficients = 0.1 -0.2 0.003 0.004 0.05\n"
@@ -759,7 +761,8 @@ LENS_KEYS = [
     "undocumented: {fisheye: true, k1: 0.2}", "curvature: -0.1",
     "mapping: equisolid", "optics_kind: stereographic", "wide_angle: true", "distortion_coefficients: some",
     "resolution: {width: 640, height: 480, distort: {type: DISTORT_FTHETA, coeffs: [0.1, -0.2, 0.02, 0.001]}}",
-    "cam_d0: [0.1]\nmodel: none", "camera_k7: 0.1", "disto_k3: [-0.2, 0.05, 0.01]",
+    "cam_d0: [0.1]\nmodel: none", "camera_k7: 0.1", "disto_k3: [-0.2, 0.05, 0.01]", "k: [0.1, -0.2]",
+    "p: [0.003, 0.004]",
 ]  # fmt: skip
 
 
@@ -913,6 +916,8 @@ REFUSED = [
     ("aspect.yaml", "focal_length: 500\naspect_ratio: 1.02\ncx: 320\ncy: 240\n", "aspect_ratio: 1.02 beside one"),
     ("xi.yaml", VINS_PINHOLE + "xi: 1.9\n", "xi may be lens distortion"),
     ("four.yaml", PINHOLE + "k1: 0.1\nk2: -0.2\nk3: 0.003\nk4: 0.004\n", "k4: k1 to k4 without p1 and p2"),
+    ("undistorted.yaml", PINHOLE + f"D: {list(FIVE)}\nundistorted: true\n", "undistorted: true, but there are coeffic"),
+    ("rectified.yaml", PINHOLE + f"D: {list(FIVE)}\nrectified: 1\n", "rectified: 1, but there are coefficients"),
     ("zeros.yaml", f"K: {[0.0] * 9}\nD: []\n", "the camera is not calibrated"),
     ("camera.ini", "[camera]\nfx = 500\nfx = 510\n", "not understood .*fx"),
     ("warp.ini", "[camera]\nfx = 500\nfy = 510\ncx = 320\ncy = 240\nlens_warp = 0.1 0.2\n", "camera.lens_warp"),
@@ -1079,8 +1084,14 @@ def test_values_in_another_unit_and_coefficients_without_a_model_are_told(make, 
     assert note in found.notes[0] and found.depth_scale is None and found.doubts(640, 480) == list(found.notes)
 
 
+def test_a_file_of_a_depth_camera_alone_is_told(make):
+    file = make.text("c.json", json.dumps({"depth_intrinsics": {"fx": 500, "fy": 510, "cx": 320, "cy": 240}}))
+    assert "is that the camera of the images, or of depth?" in read_calibration(file).notes[0]
+
+
 @pytest.mark.parametrize("line", [f"D: {list(FIVE)}", f"model: radtan\nD: {list(KC)}", "k1: 0.1\nk2: 0.1\np1: 0\np2: 0",
-                                  f"fisheye: 1\nD: {list(KC)}", "depth_scale: 5000\nbaseline: 0.12"])  # fmt: skip
+                                  f"fisheye: 1\nD: {list(KC)}", "depth_scale: 5000\nbaseline: 0.12", "k: [0, 0]",
+                                  "undistorted: true", "rectified: true"])  # fmt: skip
 def test_what_is_plain_needs_no_note(make, line):
     assert not read_calibration(make.text("c.yaml", f"{PINHOLE}{line}\n")).notes
 

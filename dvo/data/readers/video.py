@@ -24,7 +24,7 @@ from dvo.data.files.files import is_file, lookups
 from dvo.data.files.output import spelled_in_text
 from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
 from dvo.data.images.fields import DEINTERLACE, INTERLACED, LOOKED_AT, are_interlaced
-from dvo.data.images.image_header import MAX_PIXELS
+from dvo.data.images.image_header import MAX_PIXELS, holds_several
 from dvo.data.images.images import SUFFIXES, to_rgb8
 from dvo.data.images.orientation import MIRRORED, mirrors, oriented, turn
 from dvo.data.inertial import InertialSamples
@@ -72,6 +72,9 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
         # FFmpeg would follow the names in it, or show the text itself
         raise DvoError("a text file is no video", file=path, remedy="give a video or the folder that holds the images")
     if path.suffix.lower() in SUFFIXES:  # FFmpeg would read it as a video of one frame
+        if holds_several(path):
+            remedy = "take its images apart into a folder, or make a video of it"
+            raise DvoError("an animated image, or one of several pages, is no video", file=path, remedy=remedy)
         raise DvoError("one image is no video", file=path, remedy="give the folder that holds the images")
     with ExitStack() as opened:
         capture = _open(path, opened)

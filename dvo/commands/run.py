@@ -40,6 +40,7 @@ from dvo.data.streams.capture import is_stream, shown
 from dvo.data.trajectory import Trajectory
 from dvo.export.formats import TRAJECTORY_FORMATS, check_formats, export_run
 from dvo.export.recorded import ImageChoice
+from dvo.metrics import other_convention
 from dvo.odometry.load import check_early
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
 from dvo.odometry.registry import SYSTEMS, build_system
@@ -333,6 +334,8 @@ def track(
                 seconds={**facts.get("seconds", {}), **done.seconds},
             )
             scores = score(done, clip.groundtruth)
+            if clip.groundtruth is not None and (looks := other_convention(done.result.trajectory, clip.groundtruth)):
+                warn(f"the poses of the ground truth look like {looks}")
             writer = None if save_map is None else partial(_save, odometry, save_map)
             pages = Pages(clip.name, done, table, odometry, clip.groundtruth, thumbnails.images)
             hasty = done.interrupted and switch.in_haste

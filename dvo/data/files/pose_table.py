@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.clock import PARTS, Clock, in_seconds, named_times, parse_time, read_table, unit_of
+from dvo.data.files.clock import PARTS, Clock, in_seconds, named_times, parse_time, parts_of, read_table, unit_of
 from dvo.data.files.files import MAX_NUMBER, parse_number, read_lines
 from dvo.geometry.poses import poses_from_matrices
 
@@ -27,7 +27,8 @@ class _Columns:
     Attributes:
         time: column.
         unit: of the times, if the header states it.
-        nanoseconds: column of what is beyond whole seconds, None for none.
+        rest: column of what is beyond whole seconds, None for none.
+        parts: of a second in it.
         pose: columns of ``tx ty tz qx qy qz qw``.
         length: metres of a unit of the positions.
     """
@@ -36,7 +37,8 @@ class _Columns:
     unit: str | None
     pose: tuple[int, ...]
     length: float = 1.0
-    nanoseconds: int | None = None
+    rest: int | None = None
+    parts: int = PARTS["ns"]
 
 
 _TUM = _Columns(0, None, tuple(range(1, _NUMBERS)))
@@ -110,8 +112,8 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
                 continue
             pose = [parse_number(text) for text in texts]
             time = parse_time(fields[columns.time])
-            if columns.nanoseconds is not None:
-                time = int(time) * PARTS["ns"] + int(parse_time(fields[columns.nanoseconds]))
+            if columns.rest is not None:
+                time = int(time) * PARTS["ns"] + int(parse_time(fields[columns.rest])) * (PARTS["ns"] // columns.parts)
             times.append(time)
         except (ValueError, IndexError):
             raise _no_row(path, line) from None
@@ -214,8 +216,10 @@ def _named(header: Sequence[str], path: Path) -> _Columns | None:
         remedy = "leave the columns of one of them"
         raise DvoError(f"two trajectories, {both}", file=path, field="header", remedy=remedy)
     pose = tuple(found[part][0] for part in ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
-    column, unit_of_time, nanoseconds = times
-    return _Columns(column, "ns" if nanoseconds is not None else unit_of_time, pose, length, nanoseconds)
+    column, unit_of_time, rest = times
+    if rest is None:
+        return _Columns(column, unit_of_time, pose, length)
+    return _Columns(column, "ns", pose, length, rest, parts_of(header, rest))
 
 
 def _part(name: str) -> str | None:

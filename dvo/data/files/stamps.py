@@ -166,7 +166,7 @@ def times_from_names(paths: list[Path], notes: list[str] | None = None) -> np.nd
     clock = clock_of_names([re.sub(r"(?<=[0-9]{16})_[01]$", "", path.stem) for path in paths])
     if clock is None:
         return None
-    note = clock.note("the file names") if clock.unit not in ("s", "ns") else None
+    note = clock.note("the file names") if clock.unit not in ("s", "ns") or clock.zeros else None
     if note is not None and notes is not None:
         notes.append(note)
     return clock.seconds

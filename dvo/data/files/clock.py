@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.core.errors import DvoError
 from dvo.data.files.files import MAX_NUMBER, fields_of, read_lines
 
 PARTS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
@@ -232,6 +233,21 @@ def with_zeros(texts: Sequence[str]) -> list[float] | None:
     usual = float(np.median(even))
     is_even = (even > 0.5 * usual).all() and float(np.quantile(even, 0.9)) < 2 * usual
     return padded if is_even and even.std() < 0.5 * uneven.std() else None
+
+
+def refuse_lost_zeros(texts: Sequence[str], file: Path) -> None:
+    """Refuse times of a file whose fractions have lost their leading zeros, see :func:`with_zeros`.
+
+    Args:
+        texts: the times.
+        file: that they come from.
+
+    Raises:
+        DvoError: they have.
+    """
+    if with_zeros(texts) is not None:
+        message = "fractions of seconds that have lost their leading zeros, such as 7.3 for 7.000000003"
+        raise DvoError(message, file=file, field="times", remedy="write nanoseconds with nine digits")
 
 
 def in_seconds(values: Sequence[int | float], unit: str) -> np.ndarray:

@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.clock import in_seconds, is_time_name, parse_time, unit_of, with_zeros
+from dvo.data.files.clock import in_seconds, is_time_name, parse_time, refuse_lost_zeros, unit_of
 from dvo.data.files.files import is_file, read_lines
 
 
@@ -82,9 +82,7 @@ def listed_files(
         files.append(listed_file(listing, folder or listing.parent, name, number))
         times.append(time)
         texts.append(fields[0])
-    if with_zeros(texts) is not None:
-        message = "fractions of seconds that have lost their leading zeros, such as 7.3 for 7.000000003"
-        raise DvoError(message, file=listing, field="times", remedy="write nanoseconds with nine digits")
+    refuse_lost_zeros(texts, listing)
     order = sorted(range(len(times)), key=lambda row: times[row])
     ordered = [times[row] for row in order]
     return [files[row] for row in order], in_seconds(ordered, unit_of(ordered))

@@ -10,7 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.clock import PARTS, Clock, in_seconds, named_times, parse_time, parts_of, read_table, unit_of
+from dvo.data.files.clock import (
+    PARTS,
+    Clock,
+    in_seconds,
+    named_times,
+    parse_time,
+    parts_of,
+    read_table,
+    refuse_lost_zeros,
+    unit_of,
+)
 from dvo.data.files.files import MAX_NUMBER, parse_number, read_lines
 from dvo.geometry.poses import poses_from_matrices
 
@@ -121,6 +131,7 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
         lines.append(line)
     if not poses:
         raise DvoError("no poses in it, all rows are NaN", file=path, remedy=f"give a file of rows '{HEADER}'")
+    refuse_lost_zeros([fields[columns.time] for fields in table.rows], path)
     unit = columns.unit or unit_of(times, poses=True)
     seconds, values = in_seconds(times, unit), np.array(poses, dtype=np.float64)
     beyond = np.flatnonzero(~(np.abs(seconds) <= MAX_NUMBER))

@@ -11,7 +11,7 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.core.text import visible
-from dvo.data.files.clock import Table, clock_of_names, clock_of_rows, is_number, read_table
+from dvo.data.files.clock import Table, clock_of_names, clock_of_rows, is_number, read_table, refuse_lost_zeros
 from dvo.data.files.files import MAX_NUMBER, is_file
 
 NOMINAL_FPS = 30.0
@@ -48,6 +48,7 @@ def read_times(
         return _times_by_name(*named, path, images, notes)
     clock = clock_of_rows(table.rows, table.header)
     times = clock.seconds
+    refuse_lost_zeros([row[clock.column] for row in table.rows if clock.column < len(row)], path)
     for row, value in enumerate(times.tolist()):
         if not abs(value) <= MAX_NUMBER:  # NaN fails too
             fields = table.rows[row]

@@ -274,8 +274,10 @@ def test_decimals_without_their_last_zeros_are_plain():
 
 def test_lists_whose_fractions_have_lost_zeros_are_refused(make):
     rows = "".join(f"{int(t)}.{round(t % 1 * 1e9)} rgb/{k}.png\n" for k, t in enumerate(T0))
-    with pytest.raises(DvoError, match="fractions of seconds that have lost their leading zeros"):
-        listed_files(make.text("rgb.txt", rows))
+    poses = rows.replace("rgb/", "0 0 0 0 0 0 1 # ")
+    for read, text in ((listed_files, rows), (read_tum, poses), (lambda file: read_times(file, None), poses)):
+        with pytest.raises(DvoError, match="fractions of seconds that have lost their leading zeros"):
+            read(make.text("rgb.txt", text))
 
 
 def test_poses_with_seconds_and_microseconds(make):

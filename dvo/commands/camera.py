@@ -102,4 +102,5 @@ def _facts(found: SelfCalibration) -> dict[str, Any]:
     deviations = [value if math.isfinite(value) else None for value in found.aside_deviation]
     centre = {"principal_point": [c.cx, c.cy], "principal_point_deviation": deviations}
     facts = {name: getattr(found, name) for name in ("focal", "deviation", "source", "frames", "reason")}
-    return {**facts, **centre, "image_size": size, "guess": asdict(found.guess)}
+    bend = {"bend": found.bend, "bend_deviation": found.bend_deviation if found.bend else None}
+    return {**facts, **centre, **bend, "image_size": size, "guess": asdict(found.guess)}

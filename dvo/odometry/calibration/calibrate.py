@@ -41,6 +41,7 @@ from dvo.odometry.protocol import Estimate, Status
 if TYPE_CHECKING:
     from dvo.odometry.patch.tracker import PatchOdometry
 
+_LEFT = 0.5  # of a step of the focal length, at most, that the next round would take: measurements lean
 _FARTHEST_ASIDE = 0.1  # principal points further from the middle, in longer sides of the image, are not believed
 _RANGES = {
     "frames": (3, 10**6),
@@ -162,6 +163,7 @@ def calibrate(
     length = known if known >= 0 else None
     left = math.inf if length is None else length + options.spare
     tracking: _Tracking | None = None
+    believed: SelfCalibration | None = None
     for number in range(options.rounds):
         if on_round is not None:
             on_round(number + 1, options.rounds, int(min(wanted, left)))
@@ -178,6 +180,8 @@ def calibrate(
         deviation = math.hypot(options.inflation * profile.minimum.deviation / slope, options.floor)
         reason = _doubt(profile, deviation, focal * math.exp(step), guess, options)
         is_last = number + 1 == options.rounds or left < min(wanted, math.inf if length is None else length) / 2
+        if reason and believed is not None and count < believed.frames:
+            return believed  # there were not frames enough left to settle
         if reason:
             if tracking.tracked < wanted or wanted > options.frames or is_last:
                 break
@@ -191,16 +195,17 @@ def calibrate(
         bent, bend = profile.bend.value - bend, profile.bend.value
         bend_deviation = math.hypot(options.inflation * profile.bend.deviation, bent) if bend else math.inf
         if abs(step) > options.settled:  # the last round may end without having settled
-            deviation = math.hypot(deviation, step)
+            deviation = math.hypot(deviation, _LEFT * step)
         is_settled = (
             abs(step) <= options.settled
             and abs(bent) <= 2 * options.settled
             and math.dist(before, aside) <= options.max_aside * max(width, height)
         )
+        believed = result(
+            focal, deviation * focal, SELF_CALIBRATED, count, "", guess, aside, unsure, bend, bend_deviation
+        )
         if is_settled or is_last:
-            return result(
-                focal, deviation * focal, SELF_CALIBRATED, count, "", guess, aside, unsure, bend, bend_deviation
-            )
+            return believed
     return result(guess.focal, guess.deviation, guess.source, count, reason, guess)
 
 

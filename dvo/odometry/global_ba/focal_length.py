@@ -97,8 +97,8 @@ def find_focal(
         shutter: timing of the rows; a rolling shutter that is not corrected is taken for another focal length.
         options: of the adjustment; its last kernel counts.
         beyond: logarithm of a factor; a profile whose minimum is nearer to the first value is of no interest. This is a
-            quick look, without the principal point: at the keyframes, with dropped ones up to :data:`QUICK_FRAMES`, and
-            with measurements that are corrected for a rolling shutter once.
+            quick look, without the principal point, and at bends above 0 alone: at the keyframes, with dropped ones up
+            to :data:`QUICK_FRAMES`, and with measurements that are corrected for a rolling shutter once.
         lens: camera of the images as recorded, with the distortion that was taken from them before they were tracked;
             None if they were tracked as they are. What is found is that of this camera.
 
@@ -123,14 +123,14 @@ def find_focal(
     )  # fmt: skip
     freedom = len(part.patches)
     coarse = solve.focal_minimum(0.0, _STEPS[0], solve.bend)
+    bend, coarse, slope = _find_bend(solve, coarse, freedom, 0.0 if beyond is not None else _BENDS[0])
     # The minimum of a single valley is less than a step away from the lowest point that was tried.
-    if beyond is not None and abs(coarse.value) <= min(_STEPS[0] / 2, beyond - _STEPS[0]):
-        return FocalProfile(coarse, 0.0)
-    bend, slope = _UNKNOWN, 0.0
-    if beyond is None:
-        bend, coarse, slope = _find_bend(solve, coarse, freedom)
-    if not np.isfinite(coarse.deviation):
-        return FocalProfile(coarse, 0.0)
+    if (
+        not np.isfinite(coarse.deviation)
+        or beyond is not None
+        and abs(coarse.value) <= min(_STEPS[0] / 2, beyond - _STEPS[0])
+    ):
+        return FocalProfile(coarse, 0.0, bend=bend)
 
     def contrast_at(value: float) -> float:
         sides = [solve(value + side * float(np.log(1.2)), bend=bend.value) for side in (-1, 1)]
@@ -138,7 +138,7 @@ def find_focal(
 
     flat = contrast_at(coarse.value)
     if flat < MIN_CONTRAST:
-        return FocalProfile(coarse, flat)
+        return FocalProfile(coarse, flat, bend=bend)
     fine = solve.focal_minimum(coarse.value, _STEPS[1], bend.value)
     spread = math.hypot(fine.deviation, slope * bend.deviation) if bend.value else fine.deviation
     found = FocalProfile(Minimum(fine.value, spread, coarse.gain), contrast_at(fine.value), bend=bend)
@@ -154,13 +154,14 @@ def find_focal(
     return replace(found, aside=(right, down))
 
 
-def _find_bend(solve: _Solver, coarse: Minimum, freedom: int) -> tuple[Minimum, Minimum, float]:
+def _find_bend(solve: _Solver, coarse: Minimum, freedom: int, least: float) -> tuple[Minimum, Minimum, float]:
     """Bend of the lens, the minimum of the focal length there, and how much that changes with the bend.
 
     Args:
         solve: at the bend that the images were tracked with.
         coarse: minimum of the focal length at this bend.
         freedom: as for :func:`profile_minimum`.
+        least: bend that is tried.
 
     Returns:
         A bend of 0 where it is not surely above it.
@@ -175,7 +176,7 @@ def _find_bend(solve: _Solver, coarse: Minimum, freedom: int) -> tuple[Minimum, 
         found[bend] = solve.focal_minimum(start, step, bend)
         return solve(found[bend].value, bend=bend)
 
-    best = profile_minimum(cost, solve.bend, _BEND_STEPS[0], *_BENDS, freedom)
+    best = profile_minimum(cost, solve.bend, _BEND_STEPS[0], least, _BENDS[1], freedom)
     sure = _BEND_INFLATION * best.deviation
     if not (sure <= _MOST_UNSURE and best.value > _SURE * math.hypot(sure, _BEND_FLOOR)):
         if 0.0 not in found:

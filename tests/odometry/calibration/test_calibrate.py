@@ -207,6 +207,25 @@ def test_a_clip_that_does_not_tell_goes_on(clip, monkeypatch, told_at):
     assert all(index == k and focal == 200 for k, (index, focal) in enumerate(tracked[first:]))
 
 
+@pytest.mark.parametrize("second", [60, 119, 120])
+def test_a_last_round_too_short_to_tell_leaves_what_the_one_before_has_found(clip, monkeypatch, second):
+    """The first round has a curve in it. One as long that does not tell speaks against the one before."""
+    rounds = []
+
+    def profile():
+        rounds.append(len(rounds))
+        return FocalProfile(Minimum(0.2, 0.01, 0.5), 0.5 if len(rounds) == 1 else 0.001, FLAT)
+
+    track = lambda frame: Estimate(frame.timestamp, None, Status.TRACKING)  # noqa: E731
+    replace_tracking(monkeypatch, track, profile, lambda: (120, 120, second)[len(rounds)])
+    frames = [replace(clip[0], index=k, timestamp=k / 30) for k in range(120)]
+    found = calibrate(frames, FocalGuess(160.0, 40.0, "prior", 192, 144))
+    assert len(rounds) == 2 and found.found == (second < 120)
+    if found.found:
+        assert found.focal == pytest.approx(160 * math.exp(0.2)) and found.frames == 120
+        assert found.deviation > 0.1 * found.focal, "half of the last step may be left"
+
+
 def test_what_is_hardly_possible_is_judged_after_the_last_step(leaning):
     """Half of the way lies in the range of the guess, the whole of it does not."""
     narrow = FocalGuess(160.0, 160 * 0.05, "exif", 192, 144)  # 131 to 195 px
@@ -214,6 +233,13 @@ def test_what_is_hardly_possible_is_judged_after_the_last_step(leaning):
     assert not found.found and (found.focal, found.deviation) == (160.0, narrow.deviation)
     assert "fit 200 px best, which is hardly possible" in found.reason
     assert leaning(0.5, replace(narrow, deviation=160 * 0.06))[0].focal == pytest.approx(200, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("images", "focal"), [("tartanair_v1_60/image_left", 320), ("kitti00_120/image_0", 719)])
+def test_the_focal_length_of_a_real_clip_far_from_the_usual_one(data_root, images, focal):
+    found = calibrate(dvo.open(data_root / images, fps=10, guess=True))
+    assert found.found and found.focal == pytest.approx(focal, rel=0.05)
 
 
 def test_ignored_pixels_are_not_measured(clip):

@@ -18,6 +18,9 @@ NOMINAL_FPS = 30.0
 RATES = (1e-5, 1e6)
 """Slowest and fastest images a second: one a day, and more than any camera takes."""
 
+_LEAST = 5  # names
+_UNEVEN = 4  # largest interval of names that count, usual ones
+_COUNTS = 1e5  # usual interval of such names, at most
 _SHORTEST = 2e-5  # seconds between the images of a list
 
 
@@ -173,6 +176,31 @@ def times_from_names(paths: list[Path], notes: list[str] | None = None) -> np.nd
     return clock.seconds
 
 
+def without_order(paths: Sequence[Path]) -> str | None:
+    """Note about names whose order is no order of time: words, and random numbers.
+
+    Args:
+        paths: files, in the order in which they are read.
+
+    Returns:
+        A sentence; None for names that count, in decimal or hexadecimal digits.
+    """
+    stems = [path.stem for path in paths]
+    kinds = {re.sub(r"[0-9]+", "*", stem) for stem in stems}
+    if len(stems) < _LEAST or 2 * len(kinds) <= len(stems):
+        return None
+    if all(re.fullmatch(r"[0-9a-fA-F]{1,15}", stem) for stem in stems) and len({len(stem) for stem in stems}) == 1:
+        steps = np.diff(np.sort(np.array([int(stem, 16) for stem in stems], dtype=np.float64)))
+        usual = float(np.median(steps))
+        if usual <= _COUNTS and float(steps.max()) <= _UNEVEN * usual:
+            return None
+    first = ", ".join(visible(path.name) for path in paths[:2])
+    return (
+        f"the names do not tell in which order the images were taken: they are read in that of the names, {first}, ... "
+        "(--times FILE with a name and a time in each row says otherwise)"
+    )
+
+
 def checked_rate(fps: float | None, field: str = "fps") -> float | None:
     """Check frames a second.
 
@@ -248,6 +276,7 @@ def choose_times(
         if fps is not None:
             warnings.append(f"--fps was not used: the times come from {origin}")
         return found
+    warnings += filter(None, [without_order(paths)])
     if fps is None:
         warnings.append(f"no times found: assuming {NOMINAL_FPS:g} frames a second (give --times FILE or --fps F)")
     return np.arange(len(paths)) / (fps or NOMINAL_FPS)

@@ -18,7 +18,7 @@ from dvo.data.companions.inertial_source import AUTO, NONE, choose_inertial, imu
 from dvo.data.files.files import lookups
 from dvo.data.files.stamps import checked_rate
 from dvo.data.images.fields import INTERLACED, MOSAIC, are_interlaced, is_mosaic
-from dvo.data.images.halves import two_views
+from dvo.data.images.halves import FLAT, is_panorama, looks_all_around, two_views
 from dvo.data.images.image_header import holds_several
 from dvo.data.images.reduction import MAX_PIXELS, reduction_to
 from dvo.data.inertial_files.imu_calibration import ImuCalibration
@@ -171,6 +171,15 @@ def open_source(
             f"the halves of the images look alike, {halves}: if this is stereo, track one of them "
             f"(ffmpeg -vf crop={part})"
         )
+    if recording.images and is_panorama(recording.images[0]):
+        message = "the file says that it shows all around (equirectangular)"
+        if guessed is not None:
+            raise DvoError(message, file=recording.images[0], remedy=FLAT.format("IMAGE", ".png"))
+        doubts.append(f"{message}: the images are read as those of the calibration")
+    elif looks_all_around(first.image):
+        name = "IMAGE" if recording.images else "VIDEO"
+        remedy = FLAT.format(name, ".png" if recording.images else ".mp4")
+        doubts.append(f"the images look as if they showed all around, which dvo does not track: {remedy}")
     if recording.images and holds_several(recording.images[0]):
         doubts.append(
             f"{visible(recording.images[0].name)} holds several images, of which the first is read: take them apart"

@@ -24,6 +24,7 @@ from dvo.data.files.files import is_file, lookups
 from dvo.data.files.output import spelled_in_text
 from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
 from dvo.data.images.fields import DEINTERLACE, INTERLACED, LOOKED_AT, are_interlaced
+from dvo.data.images.halves import FLAT
 from dvo.data.images.image_header import MAX_PIXELS, holds_several
 from dvo.data.images.images import SUFFIXES, to_rgb8
 from dvo.data.images.orientation import MIRRORED, mirrors, oriented, turn
@@ -303,8 +304,7 @@ class VideoRecording:
         if is_sphere(path):
             message = "the file says that its images show all around (equirectangular, or the like)"
             if request.calibration is None:
-                remedy = "make a flat view of it: ffmpeg -i VIDEO -vf v360=e:flat:h_fov=90:v_fov=60 OUT.mp4"
-                raise DvoError(message, file=path, remedy=remedy)
+                raise DvoError(message, file=path, remedy=FLAT.format("VIDEO", ".mp4"))
             self.warnings.append(f"{message}: they are read as those of the calibration")
         shown = shown_seconds(path)
         if shown is not None and self.frame_count is not None and RATES[0] <= rate <= RATES[1]:

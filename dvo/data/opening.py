@@ -13,6 +13,7 @@ from dvo.core.errors import DvoError
 from dvo.data.calibration.colmap_cameras import is_calibration_file
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.files import is_file, is_folder
+from dvo.data.images.image_header import no_image
 from dvo.data.recording import Log, RawFrame, Recording
 
 _CALIBRATION = "calib.txt"
@@ -94,8 +95,10 @@ def first_frame(recording: Recording) -> RawFrame:
             raise DvoError(f"none of the {len(log.missing)} images is there", file=recording.path, remedy=remedy)
         count = len(log.unreadable)
         absent = f"; {len(log.missing)} others are not there" if log.missing else ""
+        what = no_image(recording.images[0]) if recording.images else None
+        known = f": {recording.images[0].name} is {what}" if recording.images and what else ""
         raise DvoError(
-            f"none of the {count} images decodes{absent}",
+            f"none of the {count} images decodes{known}{absent}",
             file=recording.path,
             remedy="check that the files are images that other programs can show",
         )

@@ -48,6 +48,19 @@ def test_no_image_that_decodes(make):
         open_source(folder, calib=make.calib())
 
 
+@pytest.mark.parametrize(("content", "what"), [
+    (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "a pointer of Git LFS"),
+    (b"\n<!DOCTYPE html>", "a web page"), (b"\0\0\0\x18ftypheic" + bytes(40), "HEIC, which is not read"),
+    (b"\0\0\0\x18ftypavif" + bytes(40), "AVIF, which is not read"), (b"", "empty"),
+])  # fmt: skip
+def test_what_has_the_name_of_an_image_is_named(make, content, what):
+    folder = make.images("clip", ["0.png", "1.png"])
+    for image in folder.iterdir():
+        image.write_bytes(content)
+    with pytest.raises(DvoError, match=f"none of the 2 images decodes: 0.png is {what}"):
+        open_source(folder, calib=make.calib())
+
+
 def test_no_calibration_names_the_option_and_a_file_that_lies_near(make):
     folder = make.images("clip", ["0.png"])
     with pytest.raises(DvoError, match="no calibration.*--calib FILE: "):

@@ -26,7 +26,8 @@ from dvo.geometry.poses import poses_from_matrices
 
 HEADER = "timestamp tx ty tz qx qy qz qw"
 _NUMBERS = 8
-_LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+_LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "ft": 0.3048, "feet": 0.3048, "in": 0.0254,
+            "inch": 0.0254, "um": 1e-6}  # fmt: skip
 _OTHERS = re.compile(r"v|vel|velocity|a|acc|accel|b|w|gyr|gyro|omega|lin|linear|ang|angular|bias|cov|sigma|std")
 
 
@@ -59,6 +60,7 @@ _JOINED = re.compile(  # before an axis: "posx"
     r"(?:pos|position|trans|translation|loc|location|tvec|coord|point|center|centre|gt|est|world|cam|camera|quat|"
     r"quaternion|rot|rotation|orient|orientation)$"
 )
+_BRACKETS = re.compile(r"[\[(]\s*([a-z]+)\s*[\])]")
 _OF_CAMERA = re.compile(r"(?:^|[^a-z])[tqrp]?_?(?:cw|c_w|w2c)(?:[^a-z]|$)")  # T_cw
 _IN_WORLD = re.compile(r"([tpq]_?[wxyz])_(?:world|odom|map)_[a-z]+")  # of Project Aria
 _RIGID = 0.02  # largest deviation of a rotation from an orthogonal matrix
@@ -207,7 +209,7 @@ def _named(header: Sequence[str], path: Path) -> _Columns | None:
     Raises:
         DvoError: poses of the world in the camera, or of two trajectories.
     """
-    times, length = named_times(header), 1.0
+    times = named_times(header)
     found: dict[str, list[int]] = {}
     for k, cell in enumerate(header):
         if _OF_CAMERA.search(cell.lower()):
@@ -218,8 +220,6 @@ def _named(header: Sequence[str], path: Path) -> _Columns | None:
         part = _part(in_world[1] if in_world else name)
         if part is not None:
             found.setdefault(part, []).append(k)
-            unit = re.search(r"[\[(]\s*(mm|cm|m)\s*[\])]", cell.lower())
-            length = _LENGTHS[unit[1]] if unit and part == "tx" and len(found[part]) == 1 else length
     if times is None or len(found) < _NUMBERS - 1:
         return None
     if all(len(columns) > 1 for columns in found.values()):
@@ -227,6 +227,13 @@ def _named(header: Sequence[str], path: Path) -> _Columns | None:
         remedy = "leave the columns of one of them"
         raise DvoError(f"two trajectories, {both}", file=path, field="header", remedy=remedy)
     pose = tuple(found[part][0] for part in ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
+    units = {_BRACKETS.search(header[k].lower()) for k in pose[:3]}
+    lengths = {_LENGTHS.get(unit[1], 1.0) if unit else 1.0 for unit in units}
+    if len(lengths) > 1:
+        names = ", ".join(header[k] for k in pose[:3])[:80]
+        remedy = "give all of them in metres"
+        raise DvoError(f"positions in several units: {names}", file=path, field="header", remedy=remedy)
+    (length,) = lengths
     column, unit_of_time, rest = times
     if rest is None:
         return _Columns(column, unit_of_time, pose, length)

@@ -272,6 +272,15 @@ def test_decimals_without_their_last_zeros_are_plain():
     assert clock_of_names([f"{t:.6f}".rstrip("0") for t in T0]).note("them") is None
 
 
+@pytest.mark.parametrize(("unit", "metres"), [("[m]", 1), ("[mm]", 1e-3), ("(ft)", 0.3048), ("(world)", 1)])
+def test_the_unit_of_positions(make, unit, metres):
+    header = f"time,x {unit},y {unit},z {unit},qx,qy,qz,qw\n"
+    found = read_tum(make.text("t.csv", header + "0.5,1,2,3,0,0,0,1\n"))
+    np.testing.assert_allclose(found.positions, [[metres, 2 * metres, 3 * metres]])
+    with pytest.raises(DvoError, match="positions in several units: x"):
+        read_tum(make.text("t.csv", f"time,x [mm],y [m],z {unit},qx,qy,qz,qw\n0.5,1,2,3,0,0,0,1\n"))
+
+
 def test_lists_whose_fractions_have_lost_zeros_are_refused(make):
     rows = "".join(f"{int(t)}.{round(t % 1 * 1e9)} rgb/{k}.png\n" for k, t in enumerate(T0))
     poses = rows.replace("rgb/", "0 0 0 0 0 0 1 # ")

@@ -114,8 +114,9 @@ def print_input(source: Any) -> None:
     elif count is not None and rate:
         text = f"{count} frames of a video, {rate:.4g} a second: {count / rate:.4g} s"
     lines = [] if text is None else [text]
-    if (span := depth_range(source) if hasattr(source, "reading") else None) is not None:
-        lines.append(f"depth: most of it {span[0]:.4g} to {span[1]:.4g} m")
+    depth = depth_range(source) if hasattr(source, "reading") else None
+    if depth is not None:
+        lines.append(f"depth: most of it {depth[0]:.4g} to {depth[1]:.4g} m")
     samples, positions = getattr(source, "inertial", None), getattr(source, "positions", None)
     if samples is not None:
         lines.append(described(samples))

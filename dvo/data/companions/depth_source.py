@@ -105,9 +105,11 @@ def depth_range(source: Source) -> tuple[float, float] | None:
         source: whose frames have depth; it is read from its beginning.
 
     Returns:
-        None for a source without depth, or without a readable one among the first frames.
+        None for a source without depth, or without a readable one among the first frames; and for a stream, which is
+        read once.
     """
-    if not any(getattr(stage, "field", None) == "depth" for stage in source.reading.stages):
+    has_depth = any(getattr(stage, "field", None) == "depth" for stage in source.reading.stages)
+    if type(source) is not Source or not has_depth:
         return None
     try:
         found = (frame.depth for frame in islice(source.changed(), _LOOKED_AT))

@@ -1,5 +1,7 @@
 """Depth images for any source: by time, by name, in order; registered, resized, or of another camera."""
 
+import io
+
 import cv2
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from dvo.core.errors import DvoError
 from dvo.data import Calibration, open_source
 from dvo.data.companions.depth_source import depth_range, with_depth
 from dvo.data.sensors.depth import registered_depth, resized_depth
+from dvo.data.streams.live_source import open_stream
 from dvo.geometry.camera import Camera
 from tests.support.tum_folder import depth_image, tum
 
@@ -47,6 +50,16 @@ def test_depth_in_another_unit_is_told(make, unit, told):
     said = [f"most of the depth is {told}: is it in another unit" in line for line in found.warnings]
     assert said == [True] * bool(told)
     assert depth_range(source) is None
+
+
+def test_a_stream_is_not_read_for_its_range_of_depth(make):
+    """It can be read once."""
+    code = b"".join(cv2.imencode(".png", make.image(k))[1].tobytes() for k in range(3))
+    for number in range(3):
+        depth_image(make, f"d/{number}.png", number + 1, 1000)
+    stream = open_stream(io.BytesIO(code), calib=make.calib(), fps=10)
+    source = with_depth(stream, make.root / "d")
+    assert depth_range(source) is None and depths(source) == [1, 2, 3]
 
 
 def test_paths_beside_the_source(make):

@@ -250,6 +250,16 @@ def refuse_lost_zeros(texts: Sequence[str], file: Path) -> None:
         raise DvoError(message, file=file, field="times", remedy="write nanoseconds with nine digits")
 
 
+def unit_of_dates(values: Sequence[int | float] | np.ndarray) -> str | None:
+    """Unit in which numbers are dates of this age (since 1970); None for other numbers.
+
+    Args:
+        values: the numbers.
+    """
+    size = float(np.median(np.abs(np.array(values, dtype=np.float64)))) if len(values) else 0.0
+    return next((unit for unit, parts in PARTS.items() if _is_epoch(size, parts)), None)
+
+
 def in_seconds(values: Sequence[int | float], unit: str) -> np.ndarray:
     """Seconds of numbers in a unit.
 

@@ -80,12 +80,16 @@ def read_times(
         raise DvoError(message, file=path, field="times", remedy="give seconds, or a header with the unit: 'time [ms]'")
     note = clock.note(str(path))
     if note is not None and notes is not None:
-        notes.append(f"{note} (a header such as 'time [s]' says what they are)")
+        notes.append(_with_remedy(note))
     return times
 
 
-def _named(table: Table, images: Sequence[Path]) -> tuple[Table, list[str]] | None:
-    """The table without the column that names images, and that column; None if there is none.
+def _with_remedy(note: str) -> str:
+    return f"{note} (a header such as 'time [s]' says what they are)"
+
+
+def _named(table: Table, images: Sequence[Path]) -> tuple[Table, list[str], int] | None:
+    """The table without the column that names images, that column, and its place; None if there is none.
 
     Numbers are names only if all images have one of them, beside another column.
     """
@@ -104,12 +108,12 @@ def _named(table: Table, images: Sequence[Path]) -> tuple[Table, list[str]] | No
             rows = [[*row[:k], *row[k + 1 :]] for row in table.rows]
             header = table.header
             header = [*header[:k], *header[k + 1 :]] if header and len(header) == len(table.rows[0]) else None
-            return replace(table, rows=rows, header=header), names
+            return replace(table, rows=rows, header=header), names, k
     return None
 
 
 def _times_by_name(
-    table: Table, names: list[str], path: Path, images: Sequence[Path], notes: list[str] | None
+    table: Table, names: list[str], place: int, path: Path, images: Sequence[Path], notes: list[str] | None
 ) -> np.ndarray:
     rows = dict(zip(names, range(len(names)), strict=True))
     places = [
@@ -133,7 +137,9 @@ def _times_by_name(
         if len(names) > len(images):
             others = f"{len(names) - len(images)} of the {len(names)} rows"
             notes.append(f"{others} of {path} name images that are not there")
-        notes += filter(None, [replace(clock, column=0).note(str(path))])
+        note = replace(clock, column=clock.column + (clock.column >= place)).note(str(path))
+        if note is not None:
+            notes.append(_with_remedy(note))
     return found
 
 

@@ -18,7 +18,7 @@ from dvo.core.command_line import OneLineParser
 from dvo.core.threads import settle_threads
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
-from dvo.geometry.camera import Camera
+from dvo.geometry.camera import Camera, DistortionModel
 from dvo.geometry.undistort import Undistorter
 from dvo.metrics import evaluate
 from dvo.odometry.calibration.calibrate import CalibrationOptions, calibrate
@@ -29,12 +29,13 @@ FAMILIES = ("hall", "gallery", "courtyard")
 KINDS = ("handheld", "loop")
 FIRST_SEED = 4_320_000_000
 PINHOLES = 4
-BENT: tuple[dict[str, object], ...] = (
-    {"fx": 190.0, "fy": 190.0, "model": "radtan", "coefficients": (-0.25, 0.05, 0.0, 0.0)},
-    {"fx": 180.0, "fy": 180.0, "model": "fisheye", "coefficients": (0.0, 0.0, 0.0, 0.0)},
-    {"fx": 260.0, "fy": 260.0, "model": "radtan", "coefficients": (-0.1, 0.0, 0.0, 0.0)},
+BENT: tuple[tuple[float, DistortionModel, tuple[float, ...]], ...] = (
+    (190.0, "radtan", (-0.25, 0.05, 0.0, 0.0)),
+    (180.0, "fisheye", (0.0, 0.0, 0.0, 0.0)),
+    (260.0, "radtan", (-0.1, 0.0, 0.0, 0.0)),
 )
-"""Lenses of the clips after :data:`PINHOLES`: of an action camera, equidistant, of a phone with a wide view."""
+"""Focal length and lens of the clips after :data:`PINHOLES`: of an action camera, equidistant, of a phone with a wide
+view."""
 
 
 def clip(number: int, frames: int) -> SyntheticSequence:
@@ -50,7 +51,9 @@ def clip(number: int, frames: int) -> SyntheticSequence:
     )
     if number < PINHOLES:
         return pinhole
-    return replace(pinhole, camera=replace(pinhole.camera, **BENT[(number - PINHOLES) % len(BENT)]))
+    focal, model, coefficients = BENT[(number - PINHOLES) % len(BENT)]
+    camera = replace(pinhole.camera, fx=focal, fy=focal, model=model, coefficients=coefficients)
+    return replace(pinhole, camera=camera)
 
 
 def ate_percent(frames: Sequence[Frame], camera: Camera, truth: Trajectory) -> float:

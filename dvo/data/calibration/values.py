@@ -502,13 +502,13 @@ def _lens(entries: Entries, before: list[float], path: Path) -> tuple[Distortion
     if before:
         raise DvoError(f"{4 + len(before)} intrinsics of the model {model or 'pinhole'}", file=path, field="intrinsics",
                        remedy=EXPECTED)  # fmt: skip
-    if model in ("thin_prism_fisheye", "fisheye624"):
-        keyed = [] if values else _scalars(entries, path, *LENSES[model].names, zeros=True)
-        return model, _trimmed(model, values or keyed, path)
     if model == "fisheye":
         return "fisheye", _trimmed("fisheye", values or _flat_fisheye(entries, path), path)
     if model == "none":
         return "none", _trimmed("none", values, path)
+    if model not in (None, "radtan"):
+        keyed = [] if values else _scalars(entries, path, *LENSES[model].names, zeros=True)
+        return model, _trimmed(model, values or keyed, path)
     if model is None and not values:
         _refuse_four_radial(entries, path)
     kept = _trimmed("radtan", values or _flat_radtan(entries, path), path)

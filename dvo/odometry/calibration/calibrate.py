@@ -41,6 +41,7 @@ from dvo.odometry.protocol import Estimate, Status
 if TYPE_CHECKING:
     from dvo.odometry.patch.tracker import PatchOdometry
 
+_MENDED = 5.0  # times the contrast of the round before: its measurements are of another kind
 _LEFT = 0.5  # of a step of the focal length, at most, that the next round would take: measurements lean
 _FARTHEST_ASIDE = 0.1  # principal points further from the middle, in longer sides of the image, are not believed
 _RANGES = {
@@ -158,7 +159,7 @@ def calibrate(
         return SelfCalibration(focal, deviation, source, width, height, count, reason, guess, aside, *more)
 
     focal, aside, bend, wanted, reason, count = guess.focal, (0.0, 0.0), 0.0, options.frames, "", 0
-    walk: list[tuple[float, float]] = []
+    walk: list[tuple[float, float, float]] = []
     known = length_hint(frames, -1)  # a source may not know it before it is read
     length = known if known >= 0 else None
     left = math.inf if length is None else length + options.spare
@@ -174,7 +175,7 @@ def calibrate(
             tracking = _Tracking(odometry, clip, focal * first.camera.width / width, (x, y), bend, picture)
         left -= tracking.go_on(wanted, options.interval, left, on_frame)
         profile, count = _profile(tracking.odometry, tracking.lens)
-        asked = [*walk, (math.log(focal), profile.minimum.value)]
+        asked = [*walk, (math.log(focal), profile.minimum.value, profile.contrast)]
         slope = _slope(asked)
         step = profile.minimum.value / slope
         deviation = math.hypot(options.inflation * profile.minimum.deviation / slope, options.floor)
@@ -222,21 +223,21 @@ def _readable(frames: Iterable[Frame]) -> Iterator[Frame]:
             raise
 
 
-def _slope(walk: list[tuple[float, float]]) -> float:
+def _slope(walk: list[tuple[float, float, float]]) -> float:
     """Share of the way to the focal length at which the measurements ask for no further step, that they ask for.
 
     Measurements lean towards the focal length that they were tracked with, so that a step that they ask for is too
     short; so is the deviation of the focal length that they tell. The secant through the last two rounds tells by how
-    much.
+    much, unless the last one tells the focal length far better: then the one before was not tracked well.
 
     Args:
-        walk: logarithm of the focal length of each round, and the step that its measurements ask for.
+        walk: logarithm of the focal length of each round, the step that its measurements ask for, and their contrast.
 
     Returns:
         Divisor of the last step and its deviation, 0.4 to 1.
     """
-    (at, step) = walk[-1]
-    if len(walk) == 1 or at == walk[-2][0]:
+    (at, step, contrast) = walk[-1]
+    if len(walk) == 1 or at == walk[-2][0] or contrast > _MENDED * walk[-2][2]:
         return 1.0
     return min(max((walk[-2][1] - step) / (at - walk[-2][0]), 0.4), 1.0)
 

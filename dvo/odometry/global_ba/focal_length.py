@@ -264,8 +264,8 @@ class _Solver:
         self.bend = 0.0 if lens is None else lens.coefficients[0]
         self.part = part if lens is None else _as_recorded(part, lens)
         depths = part.patches[:, 2, 0, 0].reshape(len(part.poses_cw), -1)
-        known = {(0.0, 0.0, 0.0, self.bend): (part.poses_cw, depths)}
-        self.known: dict[tuple[float, ...], tuple[Tensor, Tensor]] = known
+        present = part.poses_cw, depths
+        self.known: dict[tuple[float, ...], tuple[Tensor, Tensor]] = {(0.0, 0.0, 0.0, self.bend): present}
         focal, centre = self.part.intrinsics[0].split(2)
         self.radius = float(((self.part.centres - centre) / focal).norm(dim=1).max()) if len(part.patches) else 0.0
 

@@ -165,6 +165,27 @@ def test_the_secant_finds_the_fixed_point_of_measurements_that_lean(leaning, lea
     assert found.found and math.log(found.focal / 200) == pytest.approx(0, abs=1e-9)
 
 
+def test_a_round_that_tells_far_better_does_not_lean_as_the_one_before(clip, monkeypatch):
+    """Tracked with 256 px, the measurements ask for 160 px at a low contrast; with those, for what is right."""
+    asked = []
+
+    def track(frame):
+        if frame.index == 0:
+            asked.append(frame.camera.fx)
+        return Estimate(frame.timestamp, None, Status.TRACKING)
+
+    def profile():
+        right = len(asked) > 1
+        step = math.log((122 if right else 160) / asked[-1])
+        return FocalProfile(Minimum(step, 0.01, 0.5), 2.6 if right else 0.07, FLAT)
+
+    replace_tracking(monkeypatch, track, profile)
+    frames = [replace(clip[0], index=k, timestamp=k / 30) for k in range(60)]
+    options = CalibrationOptions(frames=30, spare=1000)
+    found = calibrate(frames, FocalGuess(256.0, 64.0, "prior", 192, 144), options=options)
+    assert found.focal == pytest.approx(122) and asked == pytest.approx([256, 160, 122])
+
+
 @pytest.mark.parametrize("share", [1.0, 0.5])
 def test_the_deviation_is_lengthened_with_the_step(leaning, share):
     found, tracked = leaning(share, FocalGuess(160.0, 40.0, "prior", 192, 144), floor=0.0)

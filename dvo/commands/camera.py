@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from dvo.commands.console import TrackingProgress, say_all, seed_everything, warn
+from dvo.data.opening import nearby_calibration
 from dvo.data.source import Source
 from dvo.odometry.calibration.calibrate import calibrate
 from dvo.odometry.calibration.camera_estimate import SelfCalibration
@@ -91,8 +92,8 @@ def _is_given(file: Path, source: Source, calib: str | None) -> bool:
 
 
 def _announcement(source: Source) -> str:
-    near = (folder / CALIBRATION for folder in (source.path, source.path.parent))
-    hint = next((f" ({file} is there: is it the one?)" for file in near if file.is_file()), "")
+    near = nearby_calibration(source.path, source.recorded_camera.width, source.recorded_camera.height)
+    hint = f" ({near} is there: is it the one?)" if near else ""
     return f"no calibration: looking for the focal length in the images; --calib FILE gives one{hint}"
 
 

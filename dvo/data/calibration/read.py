@@ -38,13 +38,14 @@ _BUILT_IN = {
     "toml": "dvo.data.calibration.values:TOML",
     "json": "dvo.data.calibration.values:JSON",
     "yaml": "dvo.data.calibration.values:DIALECT",
+    "ini": "dvo.data.calibration.values:INI",
     "text": "dvo.data.calibration.text:DIALECT",
 }
 DIALECTS = Registry("calibration dialect", "dvo.calibration_dialects", dict(_BUILT_IN))
 """Names to ``"module:DIALECT"``, each a :class:`dvo.data.calibration.calibration.Dialect`. Those of other packages come
 first, because ``text`` takes any file."""
 _NUMBERED = frozenset(["numpy", "colmap", "kitti raw", "meshroom", "openmvg", "matlab", "middlebury", "realsense",
-                       "depthai", "zed", "metashape", "toml", "json", "yaml", "xml"])  # fmt: skip
+                       "depthai", "zed", "metashape", "toml", "ini", "json", "yaml", "xml"])  # fmt: skip
 """Those that may have several cameras."""
 SHORTEST = 0.01
 """Focal length at least, widths of the images: below it, it is no number of pixels."""

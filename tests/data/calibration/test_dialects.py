@@ -934,6 +934,17 @@ def test_what_is_refused(make, name, text, match):
     assert caught.value.file == file and caught.value.remedy
 
 
+@pytest.mark.parametrize(("values", "remedy"), [
+    ({"CameraDefaults": {"CaptureSettings": [{"ImageType": 0, "Width": 640, "Height": 480, "FOV_Degrees": 90}]}}, "tan("),
+    ({"fieldOfView": 60.0, "pixelWidth": 640}, "vertical angle"), ({"fov": 90}, "horizontal angle"),
+    ({"lens": 50.0, "sensor_width": 36.0, "resolution_x": 640}, "width of the sensor"), ({"a": 1}, "write 'fx fy cx"),
+])  # fmt: skip
+def test_files_of_simulators_and_renderers_are_refused_with_the_formula(make, values, remedy):
+    with pytest.raises(DvoError, match="no fx, fy, cx, cy in it") as caught:
+        read_calibration(make.text("settings.json", json.dumps(values)))
+    assert remedy in str(caught.value.remedy)
+
+
 @pytest.mark.parametrize("text", [
     "fx,fy,cx,cy,k1,k2\n500,510,320,240,0.1,-0.2\n", "fx fy cx cy k1 k2\n500 510 320 240 0.1 -0.2\n",
     "parameter;value\nFX;500\nFY;510\nCX;320\nCY;240\nk1;0.1\nk2;-0.2\n",

@@ -935,7 +935,7 @@ def test_what_is_refused(make, name, text, match):
 
 
 @pytest.mark.parametrize(("values", "remedy"), [
-    ({"CameraDefaults": {"CaptureSettings": [{"ImageType": 0, "Width": 640, "Height": 480, "FOV_Degrees": 90}]}}, "tan("),
+    ({"CameraDefaults": {"CaptureSettings": [{"Width": 640, "Height": 480, "FOV_Degrees": 90}]}}, "tan("),
     ({"fieldOfView": 60.0, "pixelWidth": 640}, "vertical angle"), ({"fov": 90}, "horizontal angle"),
     ({"lens": 50.0, "sensor_width": 36.0, "resolution_x": 640}, "width of the sensor"), ({"a": 1}, "write 'fx fy cx"),
 ])  # fmt: skip

@@ -129,8 +129,9 @@ def test_few_bits_of_16(make, bits):
     assert len(source.warnings) == 1 and f"hold {bits} bits" in source.warnings[0]
 
 
-@pytest.mark.parametrize(("low", "factor", "told"), [(29_000, 6, "29[0-9]{3} to [23][0-9]{4} of 65535"), (2_000, 200, ""),
-                                                     (7_000, 2, "7[0-9]{3} to 7[0-9]{3} of 16383")])  # fmt: skip
+@pytest.mark.parametrize(("low", "factor", "told"), [
+    (29_000, 6, "29[0-9]{3} to [23][0-9]{4} of 65535"), (7_000, 2, "7[0-9]{3} to 7[0-9]{3} of 16383"), (2_000, 200, ""),
+])  # fmt: skip
 def test_levels_of_temperatures_are_told(make, low, factor, told):
     folder = make.root / "deep"
     folder.mkdir()

@@ -1095,6 +1095,17 @@ def test_values_in_another_unit_and_coefficients_without_a_model_are_told(make, 
     assert note in found.notes[0] and found.depth_scale is None and found.doubts(640, 480) == list(found.notes)
 
 
+@pytest.mark.parametrize(("name", "text", "told"), [
+    ("c.txt", "500 510 320 240 -0.3 0.1 0.08 -0.01", True), ("c.txt", "500 510 320 240 -0.3 0.1 0.02 -0.01", False),
+    ("c.yaml", PINHOLE + "model: radtan\nD: [-0.3, 0.1, -0.06, 0.001, 0.002]\n", True),
+    ("c.yaml", PINHOLE + "model: fisheye\nD: [-0.3, 0.1, -0.06, 0.01]\n", False),
+])  # fmt: skip
+def test_tangential_coefficients_of_no_lens_are_told(make, name, text, told):
+    """As of a fisheye, or in the order k1 k2 k3 p1 p2."""
+    notes = read_calibration(make.text(name, text)).notes
+    assert any("no usual lens" in note for note in notes) == told
+
+
 def test_a_file_of_a_depth_camera_alone_is_told(make):
     file = make.text("c.json", json.dumps({"depth_intrinsics": {"fx": 500, "fy": 510, "cx": 320, "cy": 240}}))
     assert "is that the camera of the images, or of depth?" in read_calibration(file).notes[0]

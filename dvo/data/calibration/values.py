@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -131,7 +131,9 @@ def from_values(data: Any, path: Path, camera: int | None = None) -> Calibration
         note = f"the only camera in it is {only[0]}: is that the camera of the images, or of {kind[0].lower()}?"
         read = [replace(read[0], notes=(*read[0].notes, note))]
     if not read:
-        raise DvoError(_missing(mappings), file=path, field="intrinsics", remedy=EXPECTED)
+        other = _in_other_terms(mappings)
+        remedy = EXPECTED if other is None else f"give fx = fy = {other}, cx = (width - 1) / 2, cy = (height - 1) / 2"
+        raise DvoError(_missing(mappings), file=path, field="intrinsics", remedy=remedy)
     if any(other != read[0] for other in read[1:]):
         message = f"a list of {len(read)} cameras that differ"
         raise DvoError(message, file=path, field="intrinsics", remedy="leave that of the images in it")
@@ -150,6 +152,26 @@ def _missing(mappings: Sequence[dict[str, Any]]) -> str:
     keys = [str(key)[:40] for mapping in mappings for key in mapping]
     named = f": {', '.join(keys[:8])}{' and more' if len(keys) > 8 else ''}" if keys else ""
     return f"no fx, fy, cx, cy in it, nor a camera matrix{named}"
+
+
+def _in_other_terms(mappings: Sequence[dict[str, Any]]) -> str | None:
+    """Focal length in pixels of a file of a simulator or a renderer, by an angle or in millimetres; None for others."""
+    keys = {bare(str(key)) for mapping in mappings for key in _keys(mapping)}
+    if any(key.startswith(("fov", "hfov", "fieldofview", "anglex", "xfov", "horizontalfov")) for key in keys):
+        return "width / 2 / tan(horizontal angle / 2), or height / 2 / tan(vertical angle / 2)"
+    if keys & _SENSOR and any("lens" in key or "focal" in key for key in keys):
+        return "focal length / width of the sensor * width"
+    return None
+
+
+def _keys(value: Any) -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield str(key)
+            yield from _keys(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from _keys(item)
 
 
 def _split(value: Any) -> Any:

@@ -934,6 +934,17 @@ def test_what_is_refused(make, name, text, match):
     assert caught.value.file == file and caught.value.remedy
 
 
+@pytest.mark.parametrize(("values", "remedy"), [
+    ({"CameraDefaults": {"CaptureSettings": [{"Width": 640, "Height": 480, "FOV_Degrees": 90}]}}, "tan("),
+    ({"fieldOfView": 60.0, "pixelWidth": 640}, "vertical angle"), ({"fov": 90}, "horizontal angle"),
+    ({"lens": 50.0, "sensor_width": 36.0, "resolution_x": 640}, "width of the sensor"), ({"a": 1}, "write 'fx fy cx"),
+])  # fmt: skip
+def test_files_of_simulators_and_renderers_are_refused_with_the_formula(make, values, remedy):
+    with pytest.raises(DvoError, match="no fx, fy, cx, cy in it") as caught:
+        read_calibration(make.text("settings.json", json.dumps(values)))
+    assert remedy in str(caught.value.remedy)
+
+
 @pytest.mark.parametrize("text", [
     "fx,fy,cx,cy,k1,k2\n500,510,320,240,0.1,-0.2\n", "fx fy cx cy k1 k2\n500 510 320 240 0.1 -0.2\n",
     "parameter;value\nFX;500\nFY;510\nCX;320\nCY;240\nk1;0.1\nk2;-0.2\n",
@@ -1082,6 +1093,17 @@ def test_a_size_whose_sides_are_exchanged_is_told_as_such(make):
 def test_values_in_another_unit_and_coefficients_without_a_model_are_told(make, line, note):
     found = read_calibration(make.text("c.yaml", f"{PINHOLE}{line}\n"))
     assert note in found.notes[0] and found.depth_scale is None and found.doubts(640, 480) == list(found.notes)
+
+
+@pytest.mark.parametrize(("name", "text", "told"), [
+    ("c.txt", "500 510 320 240 -0.3 0.1 0.08 -0.01", True), ("c.txt", "500 510 320 240 -0.3 0.1 0.02 -0.01", False),
+    ("c.yaml", PINHOLE + "model: radtan\nD: [-0.3, 0.1, -0.06, 0.001, 0.002]\n", True),
+    ("c.yaml", PINHOLE + "model: fisheye\nD: [-0.3, 0.1, -0.06, 0.01]\n", False),
+])  # fmt: skip
+def test_tangential_coefficients_of_no_lens_are_told(make, name, text, told):
+    """As of a fisheye, or in the order k1 k2 k3 p1 p2."""
+    notes = read_calibration(make.text(name, text)).notes
+    assert any("no usual lens" in note for note in notes) == told
 
 
 def test_a_file_of_a_depth_camera_alone_is_told(make):

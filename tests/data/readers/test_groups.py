@@ -1,5 +1,7 @@
 """Several streams in one folder."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -125,6 +127,18 @@ def test_few_bits_of_16(make, bits):
     grey[0, 0] = 255
     assert np.array_equal(frame.image[..., 0], grey)
     assert len(source.warnings) == 1 and f"hold {bits} bits" in source.warnings[0]
+
+
+@pytest.mark.parametrize(("low", "factor", "told"), [
+    (29_000, 6, "29[0-9]{3} to [23][0-9]{4} of 65535"), (7_000, 2, "7[0-9]{3} to 7[0-9]{3} of 16383"), (2_000, 200, ""),
+])  # fmt: skip
+def test_levels_of_temperatures_are_told(make, low, factor, told):
+    folder = make.root / "deep"
+    folder.mkdir()
+    for i in range(3):
+        cv2.imwrite(str(folder / f"{i}.png"), low + factor * make.image(i)[..., 1].astype(np.uint16))
+    said = " ".join(dvo.open(folder, calib=make.calib(), fps=10).warnings)
+    assert re.search(f"have levels from {told}", said) if told else "levels" not in said
 
 
 def test_what_follows_the_end_of_an_image():

@@ -142,7 +142,7 @@ def skew(v: np.ndarray) -> np.ndarray:
         ``(..., 3, 3)`` with ``skew(v) @ w = v x w``.
     """
     out = np.zeros((*v.shape[:-1], 3, 3))
-    x, y, z = np.moveaxis(v, -1, 0)
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
     return out

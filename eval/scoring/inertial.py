@@ -79,11 +79,13 @@ class InertialErrors:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Displacements over :data:`SPAN` seconds: time of their middle, estimated over true length, true length."""
+    """Displacements over :data:`SPAN` seconds: time of their middle, estimated over true length, true length; and the
+    time between those of neighbouring frames, seconds."""
 
     times: np.ndarray
     ratios: np.ndarray
     lengths: np.ndarray
+    spacing: float
 
     def scale(self, begin: float, end: float) -> float:
         """Scale over displacements whose middle lies in an interval, nan with too little motion.
@@ -94,7 +96,7 @@ class Pairs:
         inside = (self.times >= begin) & (self.times < end)
         lengths, ratios = self.lengths[inside], self.ratios[inside]
         # Displacements overlap: their sum counts a way as often as there are of them in a span.
-        if not len(lengths) or lengths.mean() * (end - begin) / SPAN < LEAST:
+        if lengths.sum() * self.spacing / SPAN < LEAST:
             return math.nan
         order = np.argsort(ratios)
         share = np.cumsum(lengths[order])
@@ -193,7 +195,8 @@ class _Run:
         keep = np.isfinite(true) & np.isfinite(found) & (true > 0.02) & (segment[first] == segment[last])
         keep &= times[last] - times[first] < 1.5 * SPAN
         first, last, true, found = first[keep], last[keep], true[keep], found[keep]
-        return Pairs((times[first] + times[last]) / 2, found / true, true)
+        spacing = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        return Pairs((times[first] + times[last]) / 2, found / true, true, spacing)
 
     def gauge(self, at: int) -> tuple[np.ndarray, np.ndarray]:
         """Turn about the vertical ``(3, 3)`` and shift ``(3,)`` that put the pose of a frame where it is in truth."""

@@ -20,6 +20,7 @@ from dvo.odometry.inertial.preintegration import integrated_turn, preintegrate, 
 from dvo.odometry.inertial.smoother import (
     GRAVITY,
     NODE,
+    SHIFT,
     STATE,
     Past,
     Similarities,
@@ -71,6 +72,9 @@ MAX_ROTATION_FACTOR = 8.0
 """Factor of the noise of visual orientations above which samples and images do not fit."""
 MAX_SHIFT = 0.02
 """Change of the time offset since the alignment above which the clocks drift, seconds."""
+CLOCK_EVERY, CLOCK_SPAN, MAX_DRIFT = 4.0, 6.0, 1e-3
+"""Seconds between looks at the clock of the samples; of a segment that tells its drift; and drift, seconds a second,
+beyond three of its deviations, with which samples are no use."""
 MAX_BIASES = (0.15, 1.0)
 """Biases that no working sensor has, rad/s and m/s^2."""
 AGREEMENT = 0.03
@@ -85,6 +89,8 @@ SURE_OFFSET, SURE_TURN = 3e-3, 0.5
 the rotation within a readout."""
 HELD = 0.05
 """Seconds for which the newest sample is held."""
+LEAD = 0.03
+"""Seconds of samples beyond the nodes, by which a time offset that is not known yet may change."""
 LONGEST_GAP = 0.02
 """Between samples that tell a rotation within a readout, seconds."""
 STILL = (0.02, 0.15)
@@ -185,6 +191,7 @@ class InertialEstimator:
         self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
         self._past: list[BodyState] = []  # states that were newest
         self._held = np.nan  # time of the node whose heading and position are held
+        self._drift, self._watched = "", -np.inf  # what is told of a clock that drifts; time of the last look at it
         self._smoother = SmootherOptions()
         self._known: list[int] = []  # worlds of the solution, in its order
 
@@ -251,6 +258,7 @@ class InertialEstimator:
         if self.solution is not None:  # the window begins with a node that is known
             known = np.isin(np.round(nodes.times, 6), np.round(self.solution.times, 6))
             nodes, worlds = _chosen(nodes, worlds, np.arange(len(nodes)) >= int(known.argmax()))
+        self._watch_clock(nodes, time)
         problem, worlds, doubt = self._problem(nodes, worlds)
         if problem is None:
             self._refuse(doubt, time)
@@ -258,7 +266,11 @@ class InertialEstimator:
         try:
             found = self._solved(problem, worlds)
         except _DisagreementError as disagreement:
-            self._refuse(str(disagreement), time)
+            offset = self._found_offset(nodes)
+            told = f"; the rotations fit with an offset of {1000 * offset:.0f} ms" if abs(offset) > HELD else ""
+            self._refuse(f"{disagreement}{told}", time)
+            if offset and abs(offset) <= HELD:
+                self.first_offset, self._next = offset, time
             return
         except np.linalg.LinAlgError:
             found = None
@@ -285,12 +297,12 @@ class InertialEstimator:
         Returns:
             A state for each time, with its covariance. A sensor that stands still does not move.
         """
-        samples = self.stream.samples()
-        assert samples is not None and self.solution is not None
+        assert self.solution is not None
         offset = self.solution.time_offset
+        samples = self.stream.near(start.time + offset - 0.5, times[-1] + offset + 0.5)
         found, state = [], start
         for time in times.tolist():
-            state = _step(state, time, offset, samples, self.noise)
+            state = state if samples is None else _step(state, time, offset, samples, self.noise)
             found.append(state)
         return found
 
@@ -396,13 +408,13 @@ class InertialEstimator:
         past = [state for state in self._past if state.time <= self._held + 1e-6]
         if not past:
             return found.covariance
-        state, up = past[-1], np.array([0.0, 0.0, 1.0])
+        state = past[-1]
         told = np.zeros((4, STATE))  # heading and position of that state
         told[0, :3], told[1:, 3:6] = state.rotation[2], np.eye(3)
         follows = np.zeros((len(found.covariance), 4))  # the newest state by these
         follows[:3, 0] = found.rotation[-1][2]
-        follows[3:6, 0] = np.cross(up, found.position[-1] - state.position)
-        follows[6:9, 0] = np.cross(up, found.velocity[-1])
+        (x, y, _), (u, v, _) = found.position[-1] - state.position, found.velocity[-1]
+        follows[3:9, 0] = -y, x, 0.0, -v, u, 0.0  # about the vertical
         follows[3:6, 1:] = np.eye(3)
         chain = follows @ told
         return found.covariance + chain @ state.covariance @ chain.T
@@ -558,6 +570,8 @@ class InertialEstimator:
     def _problem(self, nodes: VisualNodes, worlds: list[int]) -> tuple[Smoother | None, list[int], str]:
         """Problem of nodes that samples cover, and the worlds of its segments; None and why there is none."""
         samples, turn = self.stream.samples(), self.rotation_camera_imu
+        if self._drift:
+            return None, worlds, self._drift
         if samples is None or len(samples) < 2:
             return None, worlds, "too few samples"
         if turn is None:
@@ -566,14 +580,17 @@ class InertialEstimator:
             if turn is None:
                 return None, worlds, reason
         offset = self.first_offset if self.solution is None else self.solution.time_offset
-        lead = 0.03 + abs(offset)
-        kept = (nodes.times + lead <= samples.timestamps[-1] + 0.03) & (nodes.times - lead >= samples.timestamps[0])
+        # Where the sensor's clock is ahead, the newest sample is older than the newest frame.
+        times = nodes.times + offset
+        kept = (times <= samples.timestamps[-1] + HELD) & (times - LEAD >= samples.timestamps[0])
         if not kept.all():
             nodes, worlds = _chosen(nodes, worlds, kept)
         enough = self.options.first if not self.aligned else 2 * self.options.interval
         if len(nodes) < 3 or nodes.times[-1] - nodes.times[0] < enough:
             return None, worlds, "too few poses"
         near = samples.between(nodes.times[0] - 0.5, nodes.times[-1] + 0.5)
+        last = float(nodes.times[-1]) + offset + (0.0 if self.aligned else LEAD)
+        near = _held(near, min(last, float(samples.timestamps[-1]) + HELD))
         force = float(np.median(np.linalg.norm(near.accel, axis=1))) if len(near) else 0.0
         if not GRAVITY_RANGE[0] <= force <= GRAVITY_RANGE[1]:
             return None, worlds, f"the median specific force is {force:.3g} m/s^2 where gravity is 9.81: units, or axes"
@@ -599,6 +616,40 @@ class InertialEstimator:
         self._smoother = replace(self._smoother, extrinsic_sigma=FOUND_EXTRINSIC)
         self.history.append({"time": float(nodes.times[-1]), "event": "rotation between sensor and camera found"})
         return ""
+
+    def _offset_by_turns(self, nodes: VisualNodes) -> tuple[float, float] | None:
+        """Time offset by the rotations of nodes of one segment alone, and its deviation; None: they do not tell it."""
+        samples, turn = self.stream.samples(), self.rotation_camera_imu
+        if samples is None or turn is None:
+            return None
+        near = samples.between(nodes.times[0] - 1.0, nodes.times[-1] + 1.0)
+        found = align_imu(nodes.times, nodes.rotation, near.timestamps, near.gyro, turn, fixed=True)
+        if found.reason or found.sigma_offset > SURE_OFFSET or found.residual > SURE_TURN:
+            return None
+        return found.time_offset, found.sigma_offset
+
+    def _watch_clock(self, nodes: VisualNodes, time: float) -> None:
+        """Compare the time offsets of two halves of the newest segment now and then: a clock that drifts is no use."""
+        mine = nodes.of(int(nodes.segment[-1]))
+        span = float(mine.times[-1] - mine.times[0])
+        if self._drift or time < self._watched + CLOCK_EVERY or span < CLOCK_SPAN:
+            return
+        self._watched, early = time, mine.times <= mine.times[0] + span / 2
+        halves = [self._offset_by_turns(mine.where(half)[0]) for half in (early, ~early)]
+        if halves[0] is None or halves[1] is None:
+            return
+        (before, sigma), (after, other) = halves
+        rate, known = 2 * (after - before) / span, 2 * float(np.hypot(sigma, other)) / span
+        if abs(rate) - 3 * known > MAX_DRIFT:
+            self._drift = f"the clock of the samples drifts by {1000 * rate:.1f} ms a second"
+            self._failures = FAILURES  # at once
+
+    def _found_offset(self, nodes: VisualNodes) -> float:
+        """Time offset by rotations, where they tell another one than an alignment began with; 0 otherwise."""
+        if self.history:  # an offset that another one follows is a clock that drifts
+            return 0.0
+        found = self._offset_by_turns(nodes.of(int(nodes.segment[-1])))
+        return 0.0 if found is None or abs(found[0] - self.first_offset) < SHIFT else found[0]
 
     def _solved(self, problem: Smoother, worlds: list[int]) -> Smoothed | None:
         """The best solution from some starts."""
@@ -822,7 +873,8 @@ class InertialEstimator:
         self._follow(found)
         state = self.last_state()
         assert state is not None
-        self._past.append(state)
+        before = [k for k, known in enumerate(self._past) if known.time <= self._held + 1e-6]
+        self._past = [*self._past[before[-1] if before else 0 :], state]  # those that are told of, now or later
         if found.past is not None:
             self._next = self._whole + BETWEEN
 
@@ -890,7 +942,7 @@ def _words(reason: str) -> str:
 def _held(samples: InertialSamples, until: float) -> InertialSamples:
     """Samples of which the newest is held until a time soon after it, as where the sensor's clock is ahead."""
     stamps = samples.timestamps
-    if not len(samples) or not 0 < until - stamps[-1] < HELD:
+    if not len(samples) or not 0 < until - stamps[-1] <= HELD:
         return samples
     gyro, accel = (np.concatenate([values, values[-1:]]) for values in (samples.gyro, samples.accel))
     return replace(samples, timestamps=np.append(stamps, until), gyro=gyro, accel=accel)

@@ -110,8 +110,9 @@ def preintegrate(
             (:class:`dvo.ba.inertial_factor.BiasWalk`).
 
     Returns:
-        ``K`` intervals. Noise is taken as independent between steps; an interval of a few samples then has a
-        covariance some percent too large, since two neighbours share the sample at their border.
+        ``K`` intervals. Noise is taken as independent between steps, and as white within a step, so that a single step
+        does not tie position and velocity; an interval of a few samples then has a covariance some percent too large,
+        since two neighbours share the sample at their border.
 
     Raises:
         DvoError: times or samples that do not increase, samples or biases that are not finite.
@@ -318,6 +319,8 @@ def _at_once(s: _Steps, variance: Array) -> tuple[Array, ...]:
     turn[:, :3, :3], turn[:, 3:6, 3:6], turn[:, 6:, 6:] = np.eye(3), inverse, inverse
     by_bias = -turn @ np.add.reduceat(effect, start, axis=0)  # a bias is subtracted
     covariance = turn @ covariance @ np.swapaxes(turn, -1, -2)
+    within = np.add.reduceat(variance[:, 1] * s.dt[:, 0] ** 4 / 12, start)
+    covariance[:, range(6, 9), range(6, 9)] += within[:, None]
     return inverse @ s.rotation[end], velocity[..., 0], position[..., 0], covariance, by_bias
 
 

@@ -121,6 +121,8 @@ def integrate(
                     for z in range(6):
                         total += variance[step, z // 3] * b[x, z] * b[y, z]
                     sigma[x, y] = total
+                if x >= 6:  # of the force within the step
+                    sigma[x, x] += variance[step, 1] * t * t * t * t / 12
                 for y in range(6):
                     j[x, y] = jacobian[x, y] - b[x, y]
             r[:] = r1

@@ -39,6 +39,9 @@ SHIFTED = 0.8
 """Visual shift that goes with a visual turn that is wrong, in usual depths of the scene."""
 RECENT = 2.0
 """Seconds before the newest node from which an estimate goes on, until the next one of the whole window."""
+HASTE = 2.0
+"""Angular rate, rad/s, at which images tell a motion half as well as at rest, and then worse with its square: blur, and
+little that is seen for long."""
 USUAL = 10.0
 """Measurements that the usual noise of visual poses counts for, where it is estimated."""
 _FIXED = 1e18  # information of an unknown that is held
@@ -91,7 +94,7 @@ class SmootherOptions:
         rotation_factor, position_factor, scale_factor: of the noise of these.
         extrinsic_sigma: of the rotation between sensor and camera, rad.
         offset_sigma: of the time offset, seconds.
-        iterations: of Gauss-Newton, at most.
+        iterations: of Gauss-Newton, at most, but for steps that are taken back.
     """
 
     rotation_sigma: float = 4e-4
@@ -286,6 +289,20 @@ class Smoother:
         """Number of segments."""
         return int(self.nodes.segment[-1]) + 1
 
+    @property
+    def haste(self) -> Array:
+        """``(N - 1,)`` factors of the noise of images between nodes, by the angular rate there."""
+        known = self.__dict__.get("_haste")
+        if known is None or known[0] is not self.nodes:
+            times, stamps = self.nodes.times + self.offset, self.samples.timestamps
+            rate = np.linalg.norm(self.samples.gyro - self.gyro_bias, axis=1)
+            turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(stamps))])
+            rates = np.diff(np.interp(times, stamps, turned)) / np.diff(times)
+            known = self.nodes, 1 + (rates / HASTE) ** 2
+            self.__dict__["_haste"] = known
+        factors: Array = known[1]
+        return factors
+
     def preintegrated(self, values: Values) -> Preintegration:
         """Samples between the nodes, with the present biases and time offset."""
         bias = values.bias[:-1]
@@ -417,14 +434,15 @@ def smooth(problem: Smoother, start: Values) -> Smoothed:
     """
     values, damping, motion, offset = start, 1e-6, problem.preintegrated(start), start.offset
     system, cost, error = _linearise(problem, values, motion)
-    for iteration in range(problem.options.iterations):
+    iteration = 0
+    while iteration < problem.options.iterations:
         step = solve_chain(system, damping)
         moved = _moved(problem, values, step.states, step.shared)
         # Biases are corrected to first order; another time offset asks for other samples.
         again = iteration in (1, 4) or abs(moved.offset - offset) > SHIFT
         motion_then = problem.preintegrated(moved) if again else motion
         further, lower, found = _linearise(problem, moved, motion_then)
-        if not np.isfinite(lower) or lower > cost * (1 + 1e-6) + 1e-6:
+        if not np.isfinite(lower) or lower > cost * (1 + 1e-6) + 1e-6:  # a shorter step, which is none more
             damping = max(10 * damping, 1e-4)
             if damping > 1e4:
                 break
@@ -433,6 +451,7 @@ def smooth(problem: Smoother, start: Values) -> Smoothed:
         if again:
             motion, offset = motion_then, moved.offset
         values, system, cost, error, damping = moved, further, lower, found, damping / 10
+        iteration += 1
         if done:
             break
     solved, scales = solve_chain(system, pairs=problem.past is None), values.scales(problem.nodes.segment)
@@ -605,7 +624,7 @@ def _drift_sigma(problem: Smoother) -> Array:
     nodes, options = problem.nodes, problem.options
     scale = options.scale_walk * options.scale_factor
     walk = np.array([options.rotation_walk * options.rotation_factor] * 3 + [scale])
-    sigma = walk * np.sqrt(np.diff(nodes.times))[:, None]
+    sigma = walk * (np.sqrt(np.diff(nodes.times)) * problem.haste)[:, None]
     sigma[nodes.segment[1:] != nodes.segment[:-1]] = _UNKNOWN
     return sigma
 
@@ -666,7 +685,8 @@ def _orientations(problem: Smoother, values: Values) -> tuple[_Residuals, float]
     nodes, options, segment = problem.nodes, problem.options, problem.nodes.segment
     body = problem.rotation_camera_imu @ so3_exp(values.extrinsic)
     turn = rotation_vector(values.rotation @ _turn(values.world[segment] @ nodes.rotation @ body))
-    angle = options.rotation_sigma * options.rotation_factor
+    haste = np.maximum(np.append(problem.haste, 1.0), np.insert(problem.haste, 0, 1.0))
+    angle = (options.rotation_sigma * options.rotation_factor * haste)[:, None]
     residual = (turn - values.drift[:, :3]) / angle
     if problem.past is not None:
         residual[0] = 0.0  # it has been counted
@@ -681,6 +701,7 @@ def _orientations(problem: Smoother, values: Values) -> tuple[_Residuals, float]
     for k in range(problem.segments):
         start = _SEGMENT + 4 * k + 1
         shared[segment == k, :, start : start + 3] = -np.eye(3)
+    angle = angle[..., None]
     return _Residuals(residual, robust, states / angle, np.zeros_like(states), shared / angle), cost
 
 
@@ -694,7 +715,7 @@ def _displacements(problem: Smoother, values: Values) -> tuple[_Residuals, float
     back = _turn(values.rotation[:-1])
     moved = _apply(back, np.diff(camera, axis=0))
     shrunk = np.exp(-values.scales(segment)[:-1])[:, None]
-    sigma = np.sqrt(options.variances(np.diff(nodes.times), nodes.depth[segment[:-1]])[1])[:, None]
+    sigma = (np.sqrt(options.variances(np.diff(nodes.times), nodes.depth[segment[:-1]])[1]) * problem.haste)[:, None]
     # Images tell a turn and a shift sideways apart by parallax alone: where the visual turn is wrong, so is the shift.
     turned = nodes.rotation @ body
     between = _turn(values.rotation[:-1]) @ values.rotation[1:]

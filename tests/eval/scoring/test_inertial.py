@@ -128,6 +128,18 @@ def test_wrong_alignments_are_counted(factor: float, degrees: float, wrong: int)
     assert errors_of(both, reference, truth).wrong_alignments == 2 * wrong
 
 
+def test_a_few_centimetres_between_rests_tell_no_scale() -> None:
+    reference, truth = truth_of()
+    poses, rest = reference.poses_wc.copy(), (TIMES > 10) & (TIMES < 20)
+    poses[rest] = poses[np.flatnonzero(rest)[0]]
+    after = rest & (TIMES > 15)
+    poses[after, 0] += np.minimum(0.25 * (TIMES[after] - 15), 0.05)
+    reference, found = Trajectory(TIMES, poses), poses.copy()
+    found[after, 0] += 0.2 * np.minimum(0.25 * (TIMES[after] - 15), 0.05)
+    state = np.where((TIMES > 10.6) & (TIMES < 19.4), "aligned", "initialising")
+    assert errors_of(replace(streamed_of(found, truth), scale_state=state), reference, truth).wrong_alignments == 0
+
+
 def test_gravity_is_that_of_systems_that_align() -> None:
     reference, truth = truth_of()
     run = streamed_of(tilted(reference.poses_wc, 2.0), truth)

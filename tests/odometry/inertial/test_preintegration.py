@@ -241,6 +241,24 @@ def test_a_gap_inflates_the_covariance_by_what_the_signal_does_in_such_a_time() 
     assert error @ np.linalg.solve(full.covariance[1], error) > 100
 
 
+@pytest.mark.parametrize("kernels", ["", "torch"])
+def test_an_interval_within_a_gap_does_not_tie_position_to_velocity(
+    kernels: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One step without a sample, of which a single mean force would make a covariance that has no inverse."""
+    if kernels:
+        monkeypatch.setenv("DVO_KERNELS", kernels)
+    stamps = np.arange(0, 4, 1 / 200)
+    samples = Motion(2).samples(stamps[(stamps < 1.0) | (stamps > 1.15)])
+    got = preintegrate(samples, np.array([0.9, 1.02, 1.07, 1.12, 1.4]), NONE, NONE, NOISE)
+    assert got.covered.all()
+    scale = np.sqrt(np.diagonal(got.covariance, axis1=1, axis2=2))[:, None]
+    assert np.linalg.eigvalsh(got.covariance / (scale * np.swapaxes(scale, 1, 2))).min() > 1e-3
+    given = np.linalg.solve(got.covariance[1, 3:6, 3:6], got.covariance[1, 3:6, 6:])  # position by velocity
+    left = got.covariance[1, 6:, 6:] - got.covariance[1, 6:, 3:6] @ given
+    assert np.allclose(np.diag(left), np.diag(got.covariance[1, 6:, 6:]) / 4, rtol=0.1)
+
+
 def test_intervals_without_samples_are_infinitely_uncertain() -> None:
     samples = random_samples(0, 40)
     first, last = samples.timestamps[[0, -1]]

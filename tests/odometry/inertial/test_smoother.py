@@ -117,3 +117,31 @@ def test_a_shift_that_goes_with_a_turn_is_told_by_the_gyroscope(monkeypatch: pyt
     assert found.visual_error[1] < 0.1 * apart.visual_error[1]
     errors = [abs(float(np.exp(x.worlds.log_scale[0])) / SCALE - 1) for x in (found, apart)]
     assert errors[0] < errors[1]
+
+
+def test_images_of_a_fast_turn_count_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Errors that grow with the square of the angular rate, and poses that are right where the camera is calm."""
+    errors: dict[float, list[float]] = {smoother.HASTE: [], 1e9: []}
+    for seed in range(4):
+        recording, rng = record(20 + seed, seconds=8.0), np.random.default_rng(seed)
+        s = recording.samples
+        squares = np.interp(recording.times, s.timestamps, (s.gyro**2).sum(1))
+        wrong = rng.normal(size=(len(squares), 3)) * 2e-3 * squares[:, None]
+        recording = replace(recording, rotation=recording.rotation @ so3_exp(wrong))
+        last = int(np.abs(recording.times - 7.0).argmin())
+        for haste, found in errors.items():
+            monkeypatch.setattr(smoother, "HASTE", haste)
+            result = solved(recording, 7.0)
+            world = result.worlds.rotation[0] @ recording.turn
+            error = result.velocity[-1] - world @ recording.body[2][last]
+            found.append(float(error @ np.linalg.solve(result.covariance[6:9, 6:9], error)) / 3)
+    fast, even = (np.mean(found) for found in errors.values())
+    assert fast < 0.7 * even
+
+
+def test_the_noise_of_images_grows_with_the_square_of_the_angular_rate() -> None:
+    problem = record(3, seconds=4.0).problem(0.5, 2.0)
+    at_rest = replace(problem.samples, gyro=np.zeros_like(problem.samples.gyro))
+    fast = replace(at_rest, gyro=at_rest.gyro + [0.0, 3 * smoother.HASTE, 0.0])
+    assert np.allclose(replace(problem, samples=at_rest).haste, 1.0)
+    assert np.allclose(replace(problem, samples=fast).haste, 10.0)

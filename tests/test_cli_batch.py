@@ -7,6 +7,7 @@ import io
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -435,6 +436,21 @@ def test_over_ray(tracked, videos, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(cluster.importlib, "import_module", import_or(PretendedRay(cpus=0.5)))
     assert main(line(videos, out, "--ray", "auto", "--end", "8f", "--overwrite")) == 2
     assert "no node of the Ray cluster has 1 CPU" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:{port}", "ray://127.0.0.1:{port}", "ray://[::1"])
+def test_an_address_without_a_cluster_is_said_at_once(address, videos, tmp_path, monkeypatch, capsys):
+    """Ray asks a port where nothing listens again and again, for more than ten minutes."""
+    ray = PretendedRay()
+    monkeypatch.setattr(cluster.importlib, "import_module", import_or(ray))
+    with socket.socket() as bound:  # without listening, and kept from others
+        bound.bind(("127.0.0.1", 0))
+        address = address.format(port=bound.getsockname()[1])
+        assert main(line(videos, tmp_path / "out", "--ray", address, "--system", "klt-pnp")) == 2
+    error = capsys.readouterr().err
+    assert f"--ray: no Ray cluster at '{address}'" in error and "ray start --head" in error and not ray.asked
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    assert main(line(videos, tmp_path / "out", "--ray", "auto", "--system", "klt-pnp")) == 2 and not ray.asked
 
 
 def import_or(ray: PretendedRay) -> Callable[[str], object]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -82,6 +83,12 @@ def test_missing_source(tmp_path, capsys):
     assert "nowhere.mp4" in error_of(["run", str(tmp_path / "nowhere.mp4")], tmp_path, capsys)
 
 
+def test_an_empty_source_is_not_the_working_directory(image_folder, tmp_path, capsys, monkeypatch):
+    """As of a variable of a script that is not set."""
+    monkeypatch.chdir(image_folder)
+    assert "source: an empty text" in error_of(["run", ""], tmp_path, capsys)
+
+
 def test_calibration_file_missing(image_folder, tmp_path, capsys):
     assert "gone.txt" in error_of(["run", str(image_folder), "--calib", "gone.txt"], tmp_path, capsys)
 
@@ -157,6 +164,18 @@ def test_groundtruth_that_is_none(image_folder, tmp_path, capsys):
 )
 def test_bad_options(image_folder, tmp_path, capsys, options):
     error_of(["run", str(image_folder), "--calib", calibration(tmp_path), *options], tmp_path, capsys)
+
+
+@pytest.mark.parametrize("spelling", ["{}", "{}/../images", "{}/.."])
+def test_results_among_the_images(image_folder, tmp_path, capsys, spelling):
+    """Their pictures would be images of the sequence the next time."""
+    clip = shutil.copytree(image_folder, tmp_path / "own" / "images")
+    source = clip.parent if spelling.endswith("..") else clip
+    line = ["run", str(source), "--calib", str(image_folder.parent / "calib.txt"), "--fps", "10"]
+    assert main([*line, "--out", spelling.format(clip)]) == 2
+    assert "among which the pictures of the results would be read" in capsys.readouterr().err
+    assert sorted(clip.iterdir()) == sorted(clip / file.name for file in image_folder.iterdir())
+    assert main([*line, "--out", str(clip / "results")]) == 0
 
 
 def test_out_that_is_a_file(image_folder, tmp_path, capsys):

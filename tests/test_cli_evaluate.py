@@ -8,7 +8,7 @@ import pytest
 
 from dvo.cli import main
 from dvo.data.trajectory import Trajectory, write_tum
-from dvo.geometry.poses import pose_matrices
+from dvo.geometry.poses import invert_poses, pose_matrices
 from tests.support.fake_odometry import curve
 
 TIMES = 0.1 * np.arange(60)
@@ -37,6 +37,14 @@ def test_several_against_one(files, capsys):
     assert first.startswith("half.txt: ATE ") and "60 poses, scale 2" in first and "(0.00 %" in first
     assert second.startswith("run: ATE ") and "(0.00 %" not in second
     assert "all.png" in picture and cv2.imread("all.png").std() > 1
+
+
+def test_a_reference_of_the_world_in_the_camera_is_told(files, capsys):
+    write_tum("inverse.txt", Trajectory(TIMES, invert_poses(TRUTH.poses_wc)))
+    assert main(["evaluate", "inverse.txt", "half.txt"]) == 0
+    assert "inverse.txt looks like poses of the world in the camera (T_cw)" in capsys.readouterr().err
+    assert main(["evaluate", "truth.txt", "run"]) == 0
+    assert not capsys.readouterr().err
 
 
 def rows_of(trajectory, file):

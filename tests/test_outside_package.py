@@ -1,7 +1,7 @@
 """A package outside ``dvo``, ``train`` and ``eval`` (``tests/outside``) brings a network, an odometry, a training task,
 an update operator, a factor, a reader, a system, a scene family, a trajectory format, a metric, a calibration dialect,
-a place descriptor, a loss term and a sensor of the window. It is announced by entry points, as an installed package is,
-and each part is run by the ordinary commands without editing a file."""
+a place descriptor, a selection of patches, a loss term and a sensor of the window. It is announced by entry points, as
+an installed package is, and each part is run by the ordinary commands without editing a file."""
 
 import csv
 import json
@@ -79,6 +79,11 @@ print(read_suite(folder / 'a.yaml').sequences[0].judged_by)
     "place descriptor": """
 found = dvo.load('small', loop={'descriptor': 'mean_colour'}).loops.finder
 print(found.descriptor.name, found.places.dimensions)
+""",
+    "patch selection": """
+odometry = dvo.load('small', selection='middle_row', patches=5)
+odometry.track(next(iter(dvo.open(recording))))
+print(odometry.window.patches[:, 1, 1, 1].tolist())
 """,
     "sensor": """
 from dvo.synth.sequence import make_sequence; from dvo.geometry import se3; from dataclasses import replace
@@ -226,6 +231,11 @@ def test_a_calibration_of_the_dialect_is_read(done):
 @pytest.mark.long
 def test_places_are_described_by_the_descriptor(done):
     assert done.told["place descriptor"] == "mean colour 3"
+
+
+@pytest.mark.long
+def test_patches_are_where_the_selection_puts_them(done):
+    assert done.told["patch selection"] == str([6.0] * 5)
 
 
 @pytest.mark.long

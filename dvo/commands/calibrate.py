@@ -17,7 +17,7 @@ from dvo.boards.calibrate import HEADER, BoardCalibration, BoardOptions, calibra
 from dvo.commands import NOTHING_TRACKED, OK
 from dvo.commands.console import StderrConsole, TrackingProgress, device_of, say, say_all, seed_everything, warn
 from dvo.commands.input_options import source_settings
-from dvo.commands.places import check_outputs
+from dvo.commands.places import check_apart, check_outputs
 from dvo.core.errors import DvoError
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.files import is_file
@@ -78,6 +78,8 @@ def calibrate(arguments: argparse.Namespace) -> int:
         inputs = {"--weights": arguments.weights} if board is None else {}
         inputs |= {"--times": arguments.times, "--mask": arguments.mask}
         check_outputs({"--out": folder / file}, inputs, arguments.source)
+        if board is not None:
+            check_apart(folder, arguments.source, source.recording.images)
         if board is None:
             return _without_board(source, folder, arguments)
         return _with_board(source, board, options, folder)

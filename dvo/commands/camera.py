@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from dvo.commands.console import TrackingProgress, say_all, seed_everything, warn
+from dvo.data.opening import nearby_calibration
 from dvo.data.source import Source
 from dvo.odometry.calibration.calibrate import calibrate
 from dvo.odometry.calibration.camera_estimate import SelfCalibration
@@ -91,8 +92,8 @@ def _is_given(file: Path, source: Source, calib: str | None) -> bool:
 
 
 def _announcement(source: Source) -> str:
-    near = (folder / CALIBRATION for folder in (source.path, source.path.parent))
-    hint = next((f" ({file} is there: is it the one?)" for file in near if file.is_file()), "")
+    near = nearby_calibration(source.path, source.recorded_camera.width, source.recorded_camera.height)
+    hint = f" ({near} is there: is it the one?)" if near else ""
     return f"no calibration: looking for the focal length in the images; --calib FILE gives one{hint}"
 
 
@@ -101,4 +102,5 @@ def _facts(found: SelfCalibration) -> dict[str, Any]:
     deviations = [value if math.isfinite(value) else None for value in found.aside_deviation]
     centre = {"principal_point": [c.cx, c.cy], "principal_point_deviation": deviations}
     facts = {name: getattr(found, name) for name in ("focal", "deviation", "source", "frames", "reason")}
-    return {**facts, **centre, "image_size": size, "guess": asdict(found.guess)}
+    bend = {"bend": found.bend, "bend_deviation": found.bend_deviation if found.bend else None}
+    return {**facts, **centre, **bend, "image_size": size, "guess": asdict(found.guess)}

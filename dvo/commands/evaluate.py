@@ -18,7 +18,7 @@ from dvo.core.errors import DvoError
 from dvo.data.files.output import check_place, replaced
 from dvo.data.readers.groundtruth import read_groundtruth, rows_without_times
 from dvo.data.trajectory import Trajectory
-from dvo.metrics import Metrics, align_trajectory, associate
+from dvo.metrics import Metrics, align_trajectory, associate, other_convention
 from dvo.metrics import evaluate as errors_of
 from dvo.metrics.table import shown
 from dvo.session import results
@@ -66,6 +66,8 @@ def evaluate(arguments: argparse.Namespace) -> int:
         metrics = errors_of(trajectory, reference, arguments.align, max_dt=arguments.max_dt)
         found.append(_Compared(text, trajectory, metrics))
         _print(found[-1], reference, arguments.align)
+        if (looks := other_convention(trajectory, reference, arguments.max_dt)) is not None:
+            warn(f"{arguments.reference} looks like {looks}, or else {text} does")
     good = [one for one in found if one.metrics.reason is None]
     if out is not None and good:
         _draw(out, good, reference, arguments)

@@ -91,7 +91,7 @@ def print_input(source: Any) -> None:
     """Print what a person compares with what was recorded, to stderr.
 
     Number of images, duration and rate, where the times are known before the images are read, of a video as its file
-    states them; inertial samples that frames carry, and positions of a satellite receiver.
+    states them; the range of depth, inertial samples that frames carry, and positions of a satellite receiver.
 
     Args:
         source: newly opened.
@@ -101,6 +101,7 @@ def print_input(source: Any) -> None:
     """
     from dvo.commands.console import warn
     from dvo.core.text import print_line
+    from dvo.data.companions.depth_source import depth_range
     from dvo.data.companions.inertial_source import described
 
     recording = getattr(source, "recording", None)
@@ -113,6 +114,9 @@ def print_input(source: Any) -> None:
     elif count is not None and rate:
         text = f"{count} frames of a video, {rate:.4g} a second: {count / rate:.4g} s"
     lines = [] if text is None else [text]
+    depth = depth_range(source) if hasattr(source, "reading") else None
+    if depth is not None:
+        lines.append(f"depth: most of it {depth[0]:.4g} to {depth[1]:.4g} m")
     samples, positions = getattr(source, "inertial", None), getattr(source, "positions", None)
     if samples is not None:
         lines.append(described(samples))

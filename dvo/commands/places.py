@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from dvo.core.errors import DvoError
@@ -53,6 +53,22 @@ def check_outputs(
             within = is_result(place.name) and _is_same(place.parent, folder)
             if os.path.lexists(place) and (within or _is_in(place, folder / EXPORT)):
                 raise _error(place, "--out", name)
+
+
+def check_apart(folder: Path, source: Path | str, images: Sequence[Path] | None) -> None:
+    """Check that results do not lie among the images that were read, whose reader would take the pictures for frames.
+
+    Args:
+        folder: of the results.
+        source: that is read.
+        images: of the source; None for a video or a stream.
+
+    Raises:
+        DvoError: it is the folder of the images, or that of the sequence.
+    """
+    if images and any(_is_same(folder, place) for place in (images[0].parent, Path(source))):
+        message = "is the folder of the images, among which the pictures of the results would be read the next time"
+        raise DvoError(message, file=folder, field="--out", remedy="give a folder beside or within it")
 
 
 def _is_of_our_kind(output: Path) -> bool:

@@ -23,7 +23,7 @@ from dvo.commands.input_options import input_facts, input_settings, print_input
 from dvo.commands.maps import load_in_map
 from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
-from dvo.commands.places import check_outputs
+from dvo.commands.places import check_apart, check_outputs
 from dvo.commands.report import Scores, describe_seconds, headline, print_report, score
 from dvo.commands.request import request_facts
 from dvo.commands.run_options import INPUTS
@@ -40,6 +40,7 @@ from dvo.data.streams.capture import is_stream, shown
 from dvo.data.trajectory import Trajectory
 from dvo.export.formats import TRAJECTORY_FORMATS, check_formats, export_run
 from dvo.export.recorded import ImageChoice
+from dvo.metrics import other_convention
 from dvo.odometry.load import check_early
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
 from dvo.odometry.registry import SYSTEMS, build_system
@@ -162,6 +163,7 @@ def _check_outputs(arguments: argparse.Namespace, folder: Path, source: Source) 
     outputs = {"--save-map": arguments.save_map, "--overlay": arguments.overlay, "--rerun": arguments.rerun}
     inputs = {f"--{name.replace('_', '-')}": getattr(arguments, name) for name in INPUTS}
     check_outputs(outputs, inputs, arguments.source, folder)
+    check_apart(folder, arguments.source, source.recording.images)
     found = {"the samples": getattr(source.reading.inertial, "file", None)}  # beside the source
     if source.calibration is not None:
         found["the calibration"] = source.calibration.file
@@ -332,6 +334,8 @@ def track(
                 seconds={**facts.get("seconds", {}), **done.seconds},
             )
             scores = score(done, clip.groundtruth)
+            if clip.groundtruth is not None and (looks := other_convention(done.result.trajectory, clip.groundtruth)):
+                warn(f"the poses of the ground truth look like {looks}")
             writer = None if save_map is None else partial(_save, odometry, save_map)
             pages = Pages(clip.name, done, table, odometry, clip.groundtruth, thumbnails.images)
             hasty = done.interrupted and switch.in_haste

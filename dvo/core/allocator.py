@@ -1,4 +1,4 @@
-"""Settings of the memory: of the allocator for large tensors on the CPU, and of the garbage collector."""
+"""Memory of the process: settings of the allocator and of the garbage collector, and pages that are given back."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import ctypes
 import gc
 import sys
 from collections.abc import Iterator
+from functools import cache
+from typing import Any
 
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4
 
@@ -20,13 +22,34 @@ def reuse_freed_memory() -> bool:
     Returns:
         True if the allocator was configured.
     """
+    mallopt = _of_glibc("mallopt")
+    return mallopt is not None and bool(mallopt(_MMAP_MAX, 0) and mallopt(_TRIM_THRESHOLD, 2**31 - 1))
+
+
+def release_free_memory() -> bool:
+    """Return unused pages of the heap to the system. Values are not affected.
+
+    Tracking allocates and frees temporary tensors of many sizes. Between them, on the same heap, lie features that stay
+    for some frames. The C library extends its heap when no gap fits, and returns memory only from the end: the resident
+    memory of a long sequence grows by several times what is kept of it, although the memory in use does not. Takes
+    some milliseconds, and as much again until the pages that are needed are there again.
+
+    Returns:
+        True if there were any; False too where the C library is not glibc.
+    """
+    trim = _of_glibc("malloc_trim")
+    return trim is not None and bool(trim(0))
+
+
+@cache
+def _of_glibc(name: str) -> Any:
+    """Function of the C library, None where that is not glibc."""
     if not sys.platform.startswith("linux"):
-        return False
+        return None
     try:
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-    except (OSError, AttributeError):
-        return False
-    return bool(mallopt(_MMAP_MAX, 0) and mallopt(_TRIM_THRESHOLD, 2**31 - 1))
+        return getattr(ctypes.CDLL("libc.so.6"), name)
+    except (OSError, AttributeError):  # another C library, for instance musl
+        return None
 
 
 @contextlib.contextmanager

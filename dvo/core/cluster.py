@@ -10,16 +10,19 @@ import contextlib
 import importlib
 import io
 import os
+import socket
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from dvo.core.errors import DvoError
 from dvo.core.text import first_line
 
 _POLL = 1.0  # seconds between two looks at should_stop
+_REACH = 5.0  # seconds in which an address has to answer
 _CLEANING = 5.0  # seconds that calls which are cancelled have to remove what they have begun
 
 
@@ -28,7 +31,7 @@ def connected(address: str, root: Path) -> Iterator[Any]:
     """Connect to a cluster for the time of a block.
 
     Args:
-        address: of the cluster (``auto``, ``ray://host:port``), or ``local`` for one on this machine.
+        address: of the cluster (``auto``, ``host:port``, ``ray://host:port``), or ``local`` for one on this machine.
         root: folder that a local cluster imports from; a remote one has an environment of its own.
 
     Yields:
@@ -41,17 +44,35 @@ def connected(address: str, root: Path) -> Iterator[Any]:
         ray = importlib.import_module("ray")
     except ImportError:
         raise DvoError("Ray is not installed", field="--ray", remedy="pip install 'dvo[ray]'") from None
+    _check_listens(address)
     path = os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))
-    options = {"runtime_env": {"env_vars": {"PYTHONPATH": path}}} if address == "local" else {}
+    own = {"runtime_env": {"env_vars": {"PYTHONPATH": path}}, "include_dashboard": False}
+    options: dict[str, Any] = own if address == "local" else {}
     try:
         ray.init(address=address, log_to_driver=False, **options)
     except (ConnectionError, ValueError, RuntimeError) as error:
-        message = f"no Ray cluster at '{address}' ({first_line(error)})"
-        raise DvoError(message, field="--ray", remedy="start one: ray start") from error
+        raise _no_cluster(address, error) from error
     try:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _check_listens(address: str) -> None:
+    """Raise DvoError if nothing listens at a host and port, of which Ray asks again and again for many minutes."""
+    if address == "auto":
+        address = os.environ.get("RAY_ADDRESS", address)  # which Ray looks up first
+    try:
+        place = urlsplit(address if "://" in address else f"//{address}")
+        if place.hostname and place.port:
+            socket.create_connection((place.hostname, place.port), _REACH).close()
+    except (OSError, ValueError) as error:  # of the port
+        raise _no_cluster(address, error) from error
+
+
+def _no_cluster(address: str, error: Exception) -> DvoError:
+    message = f"no Ray cluster at '{address}' ({first_line(error)})"
+    return DvoError(message, field="--ray", remedy="start one: ray start --head")
 
 
 def run_on(

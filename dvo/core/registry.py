@@ -68,6 +68,11 @@ class Registry:
         """
         self._targets.pop(name, None)
 
+    @property
+    def registered(self) -> dict[str, str]:
+        """Built-in and registered components, ``name: "module:attribute"``, without those that packages announce."""
+        return dict(self._targets)
+
     def target(self, name: str) -> str:
         """Look up a target without importing it.
 

@@ -86,7 +86,8 @@ def read_text(file: Path, remedy: str = "fix the file", limit: int = MAX_BYTES) 
 def parse_yaml(text: str, file: object | None = None, *, field: str | None = None, remedy: str = "fix the file") -> Any:
     """Parse one YAML document into plain values.
 
-    Tags of other languages are refused and run nothing; ``!!opencv-matrix`` is read as a table.
+    Tags of other languages are refused and run nothing; matrices of OpenCV are read as tables,
+    and tuples of Python as lists.
 
     Args:
         text: the document.
@@ -197,9 +198,15 @@ def _loader() -> Any:
     for kind in _CHECKED:
         BoundedLoader.add_constructor(f"tag:yaml.org,2002:{kind}", checked(kind))
     BoundedLoader.add_constructor("tag:yaml.org,2002:str", text)
-    BoundedLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", _mapping)
+    for name in ("opencv-matrix", "opencv-nd-matrix"):  # OpenCV 5 writes a vector as the latter
+        BoundedLoader.add_constructor(f"tag:yaml.org,2002:{name}", _mapping)
+    BoundedLoader.add_constructor("tag:yaml.org,2002:python/tuple", _sequence)  # PyYAML's dump of (640, 480)
     return BoundedLoader
 
 
 def _mapping(loader: Any, node: Any) -> Any:
     return loader.construct_mapping(node, deep=True)
+
+
+def _sequence(loader: Any, node: Any) -> Any:
+    return loader.construct_sequence(node, deep=True)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.data.files.files import MAX_NUMBER
 from dvo.data.frame import Frame
 from dvo.geometry.camera import Camera
 
@@ -42,9 +43,9 @@ def checked_frame(frame: Frame) -> Frame:
 
     Raises:
         DvoError: an object that is not a frame; an index that is not a whole number; a time that is not a finite
-            number; an interruption that is no text, or a silence that is no number of seconds; an image of another
-            form or type, without pixels, or with values not finite or out of range; no camera, or one of another
-            image size; a mask of another type or size. Names the frame and the field.
+            number, or above 1e12; an interruption that is no text, or a silence that is no number of seconds; an image
+            of another form or type, without pixels, or with values not finite or out of range; no camera, or one of
+            another image size; a mask of another type or size. Names the frame and the field.
 
     Example:
         >>> import numpy as np
@@ -145,6 +146,9 @@ def _seconds(time: Any, field: str) -> float:
         seconds = float("inf")
     if not math.isfinite(seconds):
         raise DvoError(f"{seconds} is not finite", field=field, remedy=remedy)
+    if abs(seconds) > MAX_NUMBER:
+        message = f"{seconds:.6g} is no number of seconds, as if it were a date in milliseconds or a finer unit"
+        raise DvoError(message, field=field, remedy="divide milliseconds by 1e3, nanoseconds by 1e9")
     return seconds
 
 

@@ -103,8 +103,8 @@ def open_masks(
     """Masks of a recording.
 
     Args:
-        path: an image, or a folder with one for each image of the recording: of the same stem, or else as many as
-            there are images, in natural order.
+        path: an image, or a folder with one for each image of the recording: of the same stem (or ``NAME.jpg.png``), or
+            else as many as there are images, in natural order.
         recording: of the images.
         size: width and height of its images.
         invert: white pixels are ignored, black ones used.
@@ -121,8 +121,9 @@ def open_masks(
         images = recording.images or []
         by_stem = {file.stem: file for file in found}
         count = recording.frame_count
-        if images and all(image.stem in by_stem for image in images):
-            files = [by_stem[image.stem] for image in images]
+        named = [by_stem.get(image.stem, by_stem.get(image.name)) for image in images]  # COLMAP: NAME.jpg.png
+        if named and all(named):
+            files = [file for file in named if file is not None]
         elif len(found) == count:
             files = found
         else:

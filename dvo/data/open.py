@@ -18,7 +18,7 @@ from dvo.data.companions.inertial_source import AUTO, NONE, choose_inertial, imu
 from dvo.data.files.files import lookups
 from dvo.data.files.stamps import checked_rate
 from dvo.data.images.fields import INTERLACED, MOSAIC, are_interlaced, is_mosaic
-from dvo.data.images.halves import two_views
+from dvo.data.images.halves import FLAT, is_panorama, looks_all_around, two_views
 from dvo.data.images.image_header import holds_several
 from dvo.data.images.reduction import MAX_PIXELS, reduction_to
 from dvo.data.inertial_files.imu_calibration import ImuCalibration
@@ -122,6 +122,8 @@ def open_source(
         return open_stream(source, **options, mask=mask, mask_invert=mask_invert)
     if queue is not None:
         raise DvoError("frames of a recording do not wait", field="queue", remedy="leave it out")
+    if source == "":
+        raise DvoError("an empty text", field="source", remedy="give a video, a folder of images or a sequence")
     path, topic = split_topic(source, topic)
     with lookups(path):
         is_there = path.exists()
@@ -153,7 +155,7 @@ def open_source(
     guessed = None
     if calibration is None:
         if not guess:
-            raise no_calibration(path, recording.warnings)
+            raise no_calibration(path, width, height, recording.warnings)
         guessed = guess_focal(recording.images[0] if recording.images else path, width, height)
         calibration = guessed.calibration
     doubts = calibration.doubts(width, height)
@@ -169,6 +171,15 @@ def open_source(
             f"the halves of the images look alike, {halves}: if this is stereo, track one of them "
             f"(ffmpeg -vf crop={part})"
         )
+    if recording.images and is_panorama(recording.images[0]):
+        message = "the file says that it shows all around (equirectangular)"
+        if guessed is not None:
+            raise DvoError(message, file=recording.images[0], remedy=FLAT.format("IMAGE", ".png"))
+        doubts.append(f"{message}: the images are read as those of the calibration")
+    elif looks_all_around(first.image):
+        name = "IMAGE" if recording.images else "VIDEO"
+        remedy = FLAT.format(name, ".png" if recording.images else ".mp4")
+        doubts.append(f"the images look as if they showed all around, which dvo does not track: {remedy}")
     if recording.images and holds_several(recording.images[0]):
         doubts.append(
             f"{visible(recording.images[0].name)} holds several images, of which the first is read: take them apart"
@@ -181,6 +192,9 @@ def open_source(
     size, masks = (width, height), None
     if mask is not None:
         masks = open_masks(locate(mask, path, "mask"), recording, size, mask_invert, reduction)
+        if len(masks.files) == 1 and masks(0, None).all():
+            name = visible(masks.files[0].name)
+            doubts.append(f"the mask {name} ignores no pixel: those that are black (0) would be")
     truth = recording.groundtruth
     if request.groundtruth is not None:
         truth = read_groundtruth(request.groundtruth, recording.timestamps, doubts)

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import re
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from numbers import Integral
 from pathlib import Path
 
 from dvo.core.errors import DvoError
 from dvo.data.calibration.colmap_cameras import is_calibration_file
+from dvo.data.calibration.read import read_calibration
 from dvo.data.files.files import is_file, is_folder
+from dvo.data.images.image_header import no_image
 from dvo.data.recording import Log, RawFrame, Recording
+
+_CALIBRATION = "calib.txt"
+_OF_A_CAMERA = re.compile(
+    r"(?!.*(?:depth|right|imu|noise|infra)).*(?:calib|camera|intrinsic|camchain|transforms|cam_params).*"
+    r"\.(?:txt|ya?ml|json|xml|toml|ini|cfg|csv|npz|bin)", re.IGNORECASE
+)  # fmt: skip
+_BESIDE = ("", "sparse/0", "intrinsic", "intrinsics", "calibration")
+_ENTRIES, _TRIED, _SMALL = 2000, 10, 2**20  # of a folder; files that are read; bytes of one
 
 
 def check_stride(stride: object) -> None:
@@ -83,23 +95,60 @@ def first_frame(recording: Recording) -> RawFrame:
             raise DvoError(f"none of the {len(log.missing)} images is there", file=recording.path, remedy=remedy)
         count = len(log.unreadable)
         absent = f"; {len(log.missing)} others are not there" if log.missing else ""
+        what = no_image(recording.images[0]) if recording.images else None
+        known = f": {recording.images[0].name} is {what}" if recording.images and what else ""
         raise DvoError(
-            f"none of the {count} images decodes{absent}",
+            f"none of the {count} images decodes{known}{absent}",
             file=recording.path,
             remedy="check that the files are images that other programs can show",
         )
     return found
 
 
-def no_calibration(path: Path, warnings: Sequence[str] = ()) -> DvoError:
+def nearby_calibration(path: Path, width: int, height: int) -> Path | None:
+    """A calibration of images of this size that lies in or beside a source and was not asked for.
+
+    Args:
+        path: file or folder that is opened.
+        width, height: of its images.
+
+    Returns:
+        ``calib.txt``, or else a file with a name of a calibration that can be read and fits; None if there is none.
+    """
+    folders = [path, path.parent] if is_folder(path) else [path.parent]
+    for folder in folders:
+        if is_file(folder / _CALIBRATION):
+            return folder / _CALIBRATION
+    for file in islice(_files_of_cameras(folders), _TRIED):
+        try:
+            read_calibration(file).camera(width, height)
+        except DvoError:
+            continue
+        return file
+    return None
+
+
+def _files_of_cameras(folders: Sequence[Path]) -> Iterator[Path]:
+    for place in (folder / name for folder in folders for name in _BESIDE):
+        try:
+            names = sorted(entry.name for entry in islice(os.scandir(place), _ENTRIES))
+        except OSError:
+            continue
+        for file in (place / name for name in names if _OF_A_CAMERA.fullmatch(name)):
+            if is_file(file) and file.stat().st_size <= _SMALL:
+                yield file
+
+
+def no_calibration(path: Path, width: int, height: int, warnings: Sequence[str] = ()) -> DvoError:
     """Error of a source without a calibration, with the name of one that lies near.
 
     Args:
         path: file or folder that is opened.
+        width, height: of its images.
         warnings: of the recording; what they say about a calibration that is there is the reason.
     """
-    nearby = [option for option in (path / "calib.txt", path.parent / "calib.txt") if option.is_file()]
-    hint = f" (is it {nearby[0]}?)" if nearby else ""
+    nearby = nearby_calibration(path, width, height)
+    hint = f" (is it {nearby}?)" if nearby else ""
     return DvoError(
         "; ".join(["no calibration", *(text for text in warnings if "camera_info" in text)]),
         file=path,

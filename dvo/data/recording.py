@@ -16,7 +16,7 @@ from dvo.core.text import visible
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.files.files import exists
 from dvo.data.images.image_header import white_value
-from dvo.data.images.images import converted, decode, few_bits, read_image, used_bits
+from dvo.data.images.images import converted, decode, few_bits, narrow_range, read_image, used_bits
 from dvo.data.images.orientation import check_zoom, common_orientation, turn
 from dvo.data.images.reduction import Reduction
 from dvo.data.inertial import InertialSamples
@@ -324,9 +324,11 @@ class ImageRecording:
         first = next((image for image in decoded if image is not None), None)
         if first is None or first.dtype != np.uint16 or white_value(self.images[0]) is not None:
             return 16
-        bits = used_bits(decode(self.images[index]) for index in some)
+        read = [decode(self.images[index]) for index in some]
+        bits = used_bits(read)
         if bits < 16:
             self.warnings.append(few_bits(bits))
+        self.warnings += filter(None, [narrow_range(read, bits)])
         return bits
 
     def _look_through(self, decoded: np.ndarray) -> None:

@@ -260,7 +260,11 @@ class Source:
         image = load() if rig is not None else None
         if rig is None or image is None:
             return None
-        camera = rig.calibration.camera(image.shape[1], image.shape[0])
+        try:
+            camera = rig.calibration.camera(image.shape[1], image.shape[0])
+        except DvoError as error:
+            raise DvoError(f"of the right images: {error.message}", file=error.file, field=error.field,
+                           remedy=error.remedy) from None  # fmt: skip
         if self.reduction is not None and image.shape[1::-1] == self.reduction.recorded:
             image, camera = self.reduction(image), self.reduction.camera(camera)
         if self.reading.undistort and camera.needs_undistortion:

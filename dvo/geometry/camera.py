@@ -6,6 +6,8 @@ Pixel centres lie at integer coordinates: the first pixel covers [-0.5, 0.5].
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from numbers import Real
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +21,8 @@ __all__ = ["Camera", "DistortionModel"]
 class Camera:
     """Pinhole camera with optional distortion.
 
+    Scalars of NumPy and torch become numbers of Python, and arrays and lists of coefficients a tuple.
+
     Attributes:
         fx, fy, cx, cy: intrinsics in pixels of a ``width`` x ``height`` image.
         width, height: image size in pixels.
@@ -30,8 +34,8 @@ class Camera:
             row; 0 for a global shutter.
 
     Raises:
-        DvoError: intrinsics that cannot belong to an image of this size, coefficients that the model does not have, or
-            a readout outside of 0 to 1 s.
+        DvoError: values that are no numbers, intrinsics that cannot belong to an image of this size, an unknown model,
+            coefficients that it does not have, or a readout outside of 0 to 1 s.
 
     Example:
         >>> camera = Camera(500.0, 500.0, 319.5, 239.5, 640, 480)
@@ -50,6 +54,7 @@ class Camera:
     readout: float = 0.0
 
     def __post_init__(self) -> None:
+        self._to_plain()
         values = (self.fx, self.fy, self.cx, self.cy, *self.coefficients)
         if not np.isfinite(values).all():
             raise DvoError("not a finite number", field="intrinsics", remedy="give fx fy cx cy in pixels")
@@ -65,6 +70,10 @@ class Camera:
                 field="intrinsics",
                 remedy="give the calibration of this image size, or scale it",
             )
+        if not isinstance(self.model, str) or self.model not in LENSES:
+            raise DvoError(
+                f"unknown lens model {str(self.model)[:40]!r}", field="model", remedy=f"use one of {', '.join(LENSES)}"
+            )
         if self.model != "none" or self.coefficients:
             LENSES[self.model].check(self.coefficients, self.model)
         if not 0 <= self.readout <= 1:  # NaN fails too
@@ -73,6 +82,29 @@ class Camera:
                 field="readout",
                 remedy="give seconds, or 0 for a global shutter",
             )
+
+    def _to_plain(self) -> None:
+        """Numbers of Python for what the user gives."""
+        for name in ("fx", "fy", "cx", "cy", "width", "height", "readout"):
+            value = getattr(self, name)
+            if type(value) is int or (type(value) is float and name not in ("width", "height")):
+                continue
+            number: int | float = _number(value, name)
+            if name in ("width", "height"):
+                if number != number or number != round(number) or abs(number) == float("inf"):
+                    raise DvoError(f"expected a whole number, got {number:g}", field=name, remedy="give pixels")
+                number = round(number)
+            object.__setattr__(self, name, number)
+        coefficients: Any = self.coefficients
+        if not (type(coefficients) is tuple and all(type(value) in (float, int) for value in coefficients)):
+            try:
+                listed = np.ravel(np.array(coefficients, dtype=np.float64)).tolist()
+            except (TypeError, ValueError):
+                listed = None
+            if listed is None or isinstance(coefficients, str | bytes | dict):
+                remedy = "give a tuple, in the order of OpenCV"
+                raise DvoError("expected numbers", field="coefficients", remedy=remedy)
+            object.__setattr__(self, "coefficients", tuple(listed))
 
     @property
     def intrinsics(self) -> np.ndarray:
@@ -138,3 +170,14 @@ class Camera:
         """
         readout = self.readout * height / self.height
         return replace(self, cx=self.cx - left, cy=self.cy - top, width=width, height=height, readout=readout)
+
+
+def _number(value: Any, name: str) -> float:
+    """Number of a scalar of any library."""
+    if isinstance(value, Real) or (getattr(value, "ndim", None) == 0 and not isinstance(value, str)):
+        try:
+            return float(value)
+        except (TypeError, ValueError, OverflowError):
+            pass
+    kind = "None" if value is None else f"an object of type {type(value).__name__}"
+    raise DvoError(f"expected a number, got {kind}", field=name, remedy="give fx, fy, cx, cy, width, height in pixels")

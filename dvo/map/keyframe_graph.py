@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.core.allocator import release_free_memory
 from dvo.geometry import se3
 from dvo.map.archive import ArchiveConfig, ArchivedKeyframe, encode_jpeg, encode_mask
-from dvo.map.heap import release_free_memory
 from dvo.map.map import Map
 from dvo.map.measurements import ArchivedEdges
 from dvo.map.window import Keyframe, Window

@@ -15,8 +15,7 @@ from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3
 from dvo.map.archive import Archive, ArchiveConfig, ArchivedKeyframe
 from dvo.map.keyframe_log import KeyframeLog
-from dvo.map.measurements import ArchivedEdges
-from dvo.map.problem import archive_problem
+from dvo.map.measurements import ArchivedEdges, depth_factors
 
 MIN_NEARNESS = 0.05
 """Points whose inverse depth is below this fraction of their keyframe's median are left out of the map, because their
@@ -77,7 +76,11 @@ class Map:
         return new
 
     def archived(self) -> Map:
-        """Map with the same archive, by references, and no log: for work beside tracking that reads it."""
+        """Map with the same archive, by references, and no log: for work beside tracking.
+
+        Keyframes and measurements are never changed in place, only replaced: the copy takes next to no time, and may be
+        corrected.
+        """
         new = Map(self.per_frame)
         new.archive = self.archive.copy()
         new.segment, new.starts, new.worlds = self.segment, list(self.starts), dict(self.worlds)
@@ -182,15 +185,16 @@ class Map:
 
         Returns:
             By increasing identifier, dropped ones included; those whose patches have been released are left out, and
-            dropped ones whose anchor is not archived.
+            dropped ones that are relative to a keyframe of the window, also by way of others.
         """
-        return [
-            frame
-            for frame in self.archive
-            if self._shares_world(frame.identifier, segment)
-            and len(frame.inverse_depth)
-            and (frame.anchor is None or frame.anchor in self.archive)
-        ]
+        found: list[ArchivedKeyframe] = []
+        placed: set[int] = set()
+        for frame in self.archive:  # an anchor comes before those that are relative to it
+            if frame.anchor is None or frame.anchor in placed:
+                placed.add(frame.identifier)
+                if self._shares_world(frame.identifier, segment) and len(frame.inverse_depth):
+                    found.append(frame)
+        return found
 
     def _shares_world(self, identifier: int, segment: int) -> bool:
         own = self.segment_of(identifier)
@@ -228,5 +232,36 @@ class Map:
         Returns:
             The problem of the :meth:`members`, on the CPU.
         """
-        members = self.members(segment)
-        return archive_problem(self.archive, members, self.poses_cw, self.per_frame, dropped, first, last)
+        edges = self.archive.edges(first, last)
+        linked = set(np.unique(np.concatenate([edges.source, edges.target])).tolist()) if first > 0 else set()
+        frames = [
+            frame
+            for frame in self.members(segment)
+            if (frame.identifier >= first or frame.identifier in linked)
+            and (last is None or frame.identifier <= last)
+            and (dropped or frame.anchor is None)
+        ]
+        identifiers = np.array([frame.identifier for frame in frames], dtype=np.int64)
+        edges = edges.select(np.isin(edges.source, identifiers) & np.isin(edges.target, identifiers))
+        ii, jj = np.searchsorted(identifiers, edges.source), np.searchsorted(identifiers, edges.target)
+        m, patches = self.per_frame, [np.column_stack([frame.centres, frame.inverse_depth]) for frame in frames]
+        return PatchProblem(
+            poses_cw=self.poses_cw(identifiers),
+            patches=torch.from_numpy(np.array(patches, dtype=np.float64)).reshape(len(frames) * m, 3, 1, 1),
+            intrinsics=torch.from_numpy(np.array([f.intrinsics for f in frames], dtype=np.float64).reshape(-1, 4)),
+            targets=torch.from_numpy(edges.position.astype(np.float64)),
+            weights=torch.from_numpy(edges.weight.astype(np.float64)),
+            ii=torch.from_numpy(ii),
+            jj=torch.from_numpy(jj),
+            kk=torch.from_numpy(ii * m + edges.patch),
+            factors=depth_factors(_measured(frames, m)),
+            identifiers=torch.from_numpy(identifiers),
+        )
+
+
+def _measured(frames: list[ArchivedKeyframe], per_frame: int) -> Tensor | None:
+    """Measured inverse depths of all patches with their weights; None if there are none."""
+    if all(frame.measured is None for frame in frames):
+        return None
+    none = np.zeros((per_frame, 2))
+    return torch.from_numpy(np.concatenate([none if f.measured is None else f.measured for f in frames])).double()

@@ -1,5 +1,6 @@
 """Errors of a trajectory: of one, of one in segments, of relative poses."""
 
+from dvo.metrics.conventions import other_convention
 from dvo.metrics.metrics import (
     MINIMUM_MATCHES,
     Alignment,
@@ -22,6 +23,7 @@ __all__ = [
     "associate",
     "evaluate",
     "fit_alignment",
+    "other_convention",
     "relative_errors",
     "relative_rotation_errors",
     "stands_still",

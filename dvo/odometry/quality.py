@@ -22,8 +22,8 @@ LEAST_AGREEMENT = 0.835
 the two lack adds up (:func:`lacks`)."""
 LEAST_TRACKED = 0.5
 """Share of frames with a pose below which a result is doubtful."""
-CHECK_FOCAL, RUN_AGAIN = 0.2, 0.25
-"""Lack of agreement, of what makes a result doubtful, above which it is asked for its focal length, and run again."""
+CHECK_CAMERA, RUN_AGAIN = 0.1, 0.25
+"""Lack of agreement, of what makes a result doubtful, above which it is asked for its camera, and run again."""
 MAX_SHIFT_GAIN = 0.4
 """Share of the cost of the followed corners of a pair of images that a shift explains, upper quartile of the pairs,
 above which the crop of the picture floats (:mod:`dvo.odometry.checks.floating_crop`)."""
@@ -31,6 +31,8 @@ MOST_FIXED = 0.2
 """Share of the image that is fixed to the camera: some of it may take part, and what is left may be little."""
 WRONG_FOCAL = 0.12
 """Logarithm of the focal length that the measurements ask for over the one that is given."""
+WRONG_BEND = 0.1
+"""Barrel distortion that the measurements ask for beyond what is given: alpha of the lens model ``eucm``, beta 1."""
 FEWEST_CHECKS = 3
 """Pairs of images with followed corners that a verdict needs."""
 MOST_STILL = 1 / 3

@@ -3,8 +3,8 @@
 A system is a class (or a function that returns an odometry), given as ``"module:Class"``, and its settings. On the
 command line it is chosen by
 
-- a name of the registry: the classical baselines and the peers below, and those that other packages announce under the
-  entry-point group ``dvo.systems``;
+- a name of the registry: the odometries without weights of :mod:`dvo.odometry.registry`, the peers below, and those
+  that other packages announce under the entry-point group ``dvo.systems``;
 - ``dvo-NAME``, the learned odometry with weights NAME of the package (NAME alone will do where no system has it), or
   ``dvo:FILE`` with a weights file;
 - ``package.module:Class``, a class that can be imported;
@@ -25,27 +25,26 @@ from typing import Any
 from dvo.core.errors import DvoError
 from dvo.core.registry import Registry, is_target
 from dvo.core.yaml_files import parse_yaml
+from dvo.odometry.registry import SYSTEMS as WITHOUT_WEIGHTS
 from eval.systems import plugin
 from eval.systems.system import System, package_facts
 
 DEFAULT = ("dvo-small", "klt-pnp", "null")
 LEARNED = "dvo:load"
 
-
-_CLASSICAL, _PEERS = "dvo.odometry.classical", "eval.systems.peers"
+_PEERS = "eval.systems.peers"
+_ABOUT = {
+    "klt-pnp": "KLT tracks, five-point essential matrix, triangulation, PnP (OpenCV)",
+    "keyframe": "two-view start, PnP, keyframes, local bundle adjustment, relocalisation (after PTAM and ORB-SLAM)",
+    "direct": "semi-dense: photometric alignment to keyframes with filtered inverse depth (after LSD-SLAM)",
+    "monoslam": "filter: EKF over camera and inverse-depth points, active search, one-point RANSAC",
+    "msckf": "inertial filter: EKF over past poses (MSCKF with first-estimate Jacobians), in metres",
+}
+_OWN = WITHOUT_WEIGHTS.registered
 CATALOGUE = (
-    System("klt-pnp", f"{_CLASSICAL}.klt_pnp:KltPnp",
-           about="KLT tracks, five-point essential matrix, triangulation, PnP (OpenCV)"),
-    System("monoslam", f"{_CLASSICAL}.monoslam.slam:MonoSlam",
-           about="filter: EKF over camera and inverse-depth points, active search, one-point RANSAC"),
-    System("keyframe", f"{_CLASSICAL}.keyframe.system:KeyframeOdometry",
-           about="two-view start, PnP, keyframes, local bundle adjustment, relocalisation (after PTAM and ORB-SLAM)"),
-    System("keyframe-loops", f"{_CLASSICAL}.keyframe.system:KeyframeOdometry", {"loops": True},
+    *(System(name, target, about=_ABOUT.get(name, target)) for name, target in _OWN.items()),
+    System("keyframe-loops", _OWN["keyframe"], {"loops": True},
            about="keyframe with loop closure: ORB matches, PnP, pose graph in Sim(3)"),
-    System("direct", f"{_CLASSICAL}.direct.system:DirectOdometry",
-           about="semi-dense: photometric alignment to keyframes with filtered inverse depth (after LSD-SLAM)"),
-    System("msckf", f"{_CLASSICAL}.msckf.system:Msckf",
-           about="inertial filter: EKF over past poses (MSCKF with first-estimate Jacobians), in metres"),
     System("orbslam3", f"{_PEERS}.orbslam3:OrbSlam3", licence="GPL-3",
            about="ORB-SLAM3 (pyorbslam3), without the official vocabulary; monocular, or in metres with "
            "sensor=stereo, rgbd, imu_monocular or imu_stereo; closes loops, unless loops=false",

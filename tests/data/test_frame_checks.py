@@ -265,6 +265,12 @@ def test_what_is_no_frame_is_refused(given):
         checked_frame(given)
 
 
+@pytest.mark.parametrize("time", [1_403_636_579_763_555_584, 1.4e18, 1.7e15, -1.7e12, 1.7e12])
+def test_dates_in_a_finer_unit_are_no_seconds(time):
+    with pytest.raises(DvoError, match="frame 7: timestamp: .* is no number of seconds"):
+        checked_frame(frame(timestamp=time))
+
+
 @pytest.mark.parametrize("index", [None, "3", 1.5])
 def test_index_must_be_a_whole_number(index):
     with pytest.raises(DvoError, match="frame: index: expected a whole number"):

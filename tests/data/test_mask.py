@@ -67,6 +67,22 @@ def test_masks_by_stem_and_by_order(make):
         open_source(folder, calib=CALIB, fps=1, mask=make.root / "order")
 
 
+def test_masks_of_colmap_are_named_after_the_whole_file(make):
+    folder = make.images("clip", ["8.png", "9.png"])
+    for index, name in enumerate(("10.png", "9.png", "8.png")):
+        write(make, f"masks/{name}.png", slice(0, 10 + index))
+    found = open_source(folder, calib=CALIB, fps=1, mask=make.root / "masks")
+    assert [rows_of(frame)[-1] for frame in found] == [11, 10]
+
+
+def test_a_mask_that_ignores_nothing_is_told(make):
+    """Such as one of 0 and 1 whose meaning is the other one, or a photograph."""
+    folder = make.images("clip", ["0.png", "1.png"])
+    file = write(make, "m.png", slice(0, 48))
+    assert "m.png ignores no pixel" in open_source(folder, calib=CALIB, fps=1, mask=file).warnings[0]
+    assert not open_source(folder, calib=CALIB, fps=1, mask=write(make, "n.png", slice(0, 47))).warnings
+
+
 def test_a_mask_is_undistorted_with_its_image(make):
     """An image that is white where it is used stays white there."""
     folder = make.root / "clip"

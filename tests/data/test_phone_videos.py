@@ -129,6 +129,12 @@ def test_a_variable_rate_does_not_hide_that_a_file_was_cut(tmp_path):
     assert "cut short" in source.warnings[-1]
 
 
+def test_the_number_of_frames_of_a_matroska_file_that_begins_late(tmp_path):
+    """As a recording of a stream: what the file states is its end."""
+    source = open_source(encode(tmp_path / "a.mkv", "-c:v", "mjpeg", "-output_ts_offset", 3600), calib=CALIB)
+    assert source.frame_count == COUNT == len(list(source)) and not source.warnings
+
+
 def test_a_video_that_begins_late_counts_from_its_first_frame(tmp_path):
     options = ("-vf", "settb=1/1000,setpts='(3+0.03*N+0.01*N*N)/TB'", "-fps_mode", "passthrough")
     file = encode(tmp_path / "late.mp4", *options, "-enc_time_base", "1/1000", "-c:v", "libx264", "-pix_fmt", "yuv420p")

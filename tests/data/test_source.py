@@ -11,6 +11,7 @@ from dvo.data import Calibration, open_source, write_kitti_poses
 from dvo.data.companions.depth_source import with_depth
 from dvo.data.companions.right_source import with_right
 from dvo.data.files.files import is_folder
+from dvo.data.opening import nearby_calibration
 
 
 def test_missing_source(tmp_path):
@@ -47,6 +48,19 @@ def test_no_image_that_decodes(make):
         open_source(folder, calib=make.calib())
 
 
+@pytest.mark.parametrize(("content", "what"), [
+    (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "a pointer of Git LFS"),
+    (b"\n<!DOCTYPE html>", "a web page"), (b"\0\0\0\x18ftypheic" + bytes(40), "HEIC, which is not read"),
+    (b"\0\0\0\x18ftypavif" + bytes(40), "AVIF, which is not read"), (b"", "empty"),
+])  # fmt: skip
+def test_what_has_the_name_of_an_image_is_named(make, content, what):
+    folder = make.images("clip", ["0.png", "1.png"])
+    for image in folder.iterdir():
+        image.write_bytes(content)
+    with pytest.raises(DvoError, match=f"none of the 2 images decodes: 0.png is {what}"):
+        open_source(folder, calib=make.calib())
+
+
 def test_no_calibration_names_the_option_and_a_file_that_lies_near(make):
     folder = make.images("clip", ["0.png"])
     with pytest.raises(DvoError, match="no calibration.*--calib FILE: "):
@@ -55,6 +69,24 @@ def test_no_calibration_names_the_option_and_a_file_that_lies_near(make):
     with pytest.raises(DvoError, match="--calib FILE") as caught:
         open_source(folder)
     assert str(nearby) in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "text"), [
+    ("seq/camera.txt", "Pinhole 50 50 31.5 23.5 0\n64 48\nnone\n64 48\n"),
+    ("seq/rgb/cam_params.json", '{"camera": {"w": 64, "h": 48, "fx": 50, "fy": 50, "cx": 31, "cy": 23}}'),
+    ("seq/sparse/0/cameras.txt", "1 PINHOLE 64 48 50 50 32 24\n"),
+    ("seq/intrinsic/intrinsic_color.txt", "50 0 32 0\n0 50 24 0\n0 0 1 0\n0 0 0 1\n"),
+])  # fmt: skip
+def test_a_calibration_that_lies_near_is_named_if_it_fits(make, name, text):
+    folder = make.images("seq/rgb", ["0.png", "1.png"])
+    make.text(str(Path(name).with_name("camera_notes.txt")), "made by someone\n")
+    make.text(str(Path(name).with_name("calib_of_another.yaml")), "{fx: 500, fy: 500, cx: 320, cy: 240}")
+    make.text(str(Path(name).with_name("intrinsic_depth.txt")), "50 50 31 23\n")
+    assert nearby_calibration(folder, 64, 48) is None
+    file = make.text(name, text)
+    assert nearby_calibration(folder, 64, 48) == file
+    with pytest.raises(DvoError, match="is it .*?\\)"):
+        open_source(folder)
 
 
 def test_intrinsics_that_do_not_fit_name_the_file(make):

@@ -40,6 +40,8 @@ CALIBRATIONS = {
     "orbslam": ("calib.yaml", ["Camera.fx: 50", "Camera.fy: 51", "Camera.cx: 31.5", "Camera.cy: 23.5",
                                "Camera.k1: -0.1", "Camera.k2: 0.01", "Camera.p1: 0.001", "Camera.p2: 0.001",
                                "Camera.width: 64", "Camera.height: 48", "Camera.bf: 5", "DepthMapFactor: 5000"]),
+    "ini": ("calib.ini", ["[camera]", "fx = 50.0", "fy = 51.0", "cx = 31.5", "cy = 23.5 ; px", "k1 = -0.1", "k2 = 0.01",
+                          "p1 = 0.0", "p2 = 0.0", "[image]", "width = 64", "height = 48"]),
     "toml": ("calib.toml", ["[cam_0]", "size = [64, 48]", "matrix = [[50.0, 0.0, 31.5], [0.0, 51.0, 23.5],",
                             "[0.0, 0.0, 1.0]]", "distortions = [0.1, -0.2, 0.003, 0.004]", "fisheye = true"]),
     "named": ("calib.txt", ["fx=50 fy=51 cx=31.5 cy=23.5"]),

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -95,3 +97,33 @@ def test_a_readout_that_cannot_be(readout: float) -> None:
     with pytest.raises(DvoError, match="0 to 1 s") as caught:
         replace(CAMERA, readout=readout)
     assert caught.value.field == "readout" and caught.value.remedy
+
+
+def test_numbers_of_other_libraries_become_plain_ones() -> None:
+    K, dist = torch.tensor([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]), np.array([[0.1, -0.2, 0.003, 0.004, 0.05]])
+    numbers: list[Any] = [K[0, 0], np.float32(510), np.array(320.0), K[1, 2].numpy(), np.int64(640), 480.0]
+    camera = Camera(*numbers, "radtan", dist)  # type: ignore[arg-type]
+    plain = Camera(500.0, 510.0, 320.0, 240.0, 640, 480, "radtan", (0.1, -0.2, 0.003, 0.004, 0.05))
+    assert camera == plain and hash(camera) == hash(plain) and repr(camera) == repr(plain)
+    assert replace(plain, coefficients=list(plain.coefficients)) == plain  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "message"),
+    [
+        ({"fx": "500"}, "fx", "expected a number, got an object of type str"),
+        ({"cy": None}, "cy", "expected a number, got None"),
+        ({"fx": np.eye(3)}, "fx", "expected a number"),
+        ({"width": 640.5}, "width", "expected a whole number, got 640.5"),
+        ({"height": float("nan")}, "height", "expected a whole number"),
+        ({"model": "plumb_bob"}, "model", "unknown lens model 'plumb_bob'"),
+        ({"model": ["radtan"]}, "model", "unknown lens model"),
+        ({"model": "radtan", "coefficients": "0.1 0 0 0"}, "coefficients", "expected numbers"),
+        ({"model": "radtan", "coefficients": {"k1": 0.1}}, "coefficients", "expected numbers"),
+        ({"model": "radtan", "coefficients": None}, "coefficients", "not a finite number"),
+    ],
+)
+def test_values_that_are_none_of_a_camera(change: dict[str, object], field: str, message: str) -> None:
+    with pytest.raises(DvoError, match=message) as caught:
+        replace(Camera(500, 510, 320, 240, 640, 480), **change)  # type: ignore[arg-type]
+    assert caught.value.field in (field, "intrinsics") and caught.value.remedy

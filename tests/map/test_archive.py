@@ -15,9 +15,10 @@ from dvo.ba.sparse.global_adjust import GlobalBAOptions, global_bundle_adjust
 from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
+from dvo.map import keyframe_graph
 from dvo.map.archive import Archive, ArchiveConfig, ArchivedKeyframe, ArrayStorage
 from dvo.map.features import FeatureCache
-from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.keyframe_graph import RELEASE_INTERVAL, KeyframeGraph
 from dvo.map.measurements import ArchivedEdges, pack_edges
 from dvo.map.window import Keyframe
 from dvo.nets.patch.patchifier import patch_coordinates
@@ -137,6 +138,20 @@ def test_everything_that_left_is_a_problem_that_bundle_adjustment_can_take():
     assert len(kept.kk) == 5 * M * 4
     # The frame of the dropped keyframe still has its row.
     assert len(graph.log.trajectory()) == 6
+
+
+def test_a_frame_whose_place_the_window_decides_is_no_member_yet():
+    """An aligned frame is relative to the newest keyframe, which is dropped later and then relative to another one."""
+    graph, poses = scene()
+    none = np.zeros(0, np.int64), np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32)
+    graph.log.add(0.6).place(6, 0)
+    graph.attach(6, 0.6, poses[5].double().numpy(), *none)
+    graph.drop(5)
+    graph.archive_oldest()
+    assert [frame.identifier for frame in graph.members(0)] == graph.problem().identifiers.tolist() == [0]
+    while len(graph.window):
+        graph.archive_oldest()
+    assert graph.problem().identifiers.tolist() == [0, 1, 2, 3, 4, 5, 6]
 
 
 @pytest.mark.long
@@ -273,3 +288,18 @@ def test_a_mapping_is_released_with_its_last_array():
     del second
     gc.collect()
     assert mapping() is None
+
+
+def test_memory_is_released_after_a_number_of_frames_kept_or_dropped(monkeypatch):
+    calls = []
+    monkeypatch.setattr(keyframe_graph, "release_free_memory", lambda: calls.append(len(graph.archive)))
+    graph, m = KeyframeGraph(2, 3, 5, torch.device("cpu")), 2
+    pose, patches = torch.tensor([0, 0, 0, 0, 0, 0, 1.0]), torch.ones(m, 3, 3, 3)
+    features = torch.zeros(m, 4, 3, 3), torch.zeros(m, 5), torch.zeros(m, 3, dtype=torch.uint8), torch.ones(4)
+    for number in range(3 * RELEASE_INTERVAL):
+        graph.window.append(Keyframe(number, 0.1 * number, 0, *features), pose, patches)
+        if number % 3 == 1:
+            graph.drop(1)
+        elif len(graph.window) > 1:
+            graph.archive_oldest()
+    assert calls == [RELEASE_INTERVAL, 2 * RELEASE_INTERVAL]

@@ -7,6 +7,7 @@ import pytest
 
 import dvo
 from dvo.data.trajectory import Trajectory
+from dvo.geometry.undistort import Undistorter
 from dvo.odometry.checks.measures import count_jumps
 from dvo.odometry.protocol import Result, SparseMap
 from dvo.odometry.quality import LEAST_AGREEMENT, MOST_DEVIATION, Quality, judge
@@ -47,6 +48,22 @@ def test_a_failure_is_not_good(film, change, number):
     """A crowd of six to twelve large bodies, a sea of two thirds, a reflection over all of the picture."""
     quality = result_of(change(np.random.default_rng(3), film, number)).quality
     assert quality.verdict == "doubtful" and quality.reason and quality.remedy
+
+
+@pytest.mark.long
+def test_a_calibration_without_the_distortion_of_the_lens_is_told():
+    """The focal length is that of the lens; without its distortion the poses are off by several percent."""
+    size = {"frames": 36, "height": 120, "width": 160, "fps": 15.0}
+    walk = make_sequence(61, family="room", kind="handheld", speed=3.0, **size)
+    lens = replace(walk.camera, fx=110.0, fy=110.0, model="eucm", coefficients=(0.4, 1.0))
+    recorded = list(replace(walk, camera=lens))
+    pinhole = replace(lens, model="none", coefficients=())
+    quality = result_of([replace(frame, camera=pinhole) for frame in recorded]).quality
+    assert quality.verdict == "doubtful" and "a lens with more barrel distortion" in quality.reason
+    assert "--calib FILE" in quality.remedy
+    right = Undistorter(lens)
+    frames = [replace(frame, image=right(frame.image), camera=right.camera) for frame in recorded]
+    assert result_of(frames).quality.verdict == "good"
 
 
 @pytest.mark.long

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import json
 import re
 import tomllib
@@ -15,12 +16,14 @@ from dvo.data.calibration.calibration import EXPECTED
 
 _TIGHT = re.compile(r"^(\s*[A-Za-z_][\w.]*):(?=[\w.+\-\"'\[{])", re.MULTILINE)  # OpenCV reads "Viewer.PointSize:2"
 _PADDED = re.compile(r"(?<=[ \[,])0+(?=[1-9][0-9]*(?:[ ,\]]|$))", re.MULTILINE)  # no octal numbers
+_COMMENT = re.compile(r"^[ \t]*//.*$", re.MULTILINE)  # OpenCV writes such lines into JSON
 _END = re.compile(r"^(?:---|\.\.\.)(?=\s|$)", re.MULTILINE)
+_SECTION = re.compile(r"\[[A-Za-z][^\[\],=]*\](?:\s*[#;].*)?")
 _HEADING = re.compile(r"[A-Za-z][A-Za-z _]*")
 
 
 def load_documents(text: str, path: Path) -> list[Any]:
-    """Parse YAML of one document or several, also with OpenCV's ``%YAML:1.0`` head, its ``!!opencv-matrix`` tags, keys
+    """Parse YAML of one document or several, also with OpenCV's ``%YAML:1.0`` head, its tags of matrices, keys
     without a blank after the colon, zeros before a number, and tabs for blanks.
 
     Args:
@@ -70,7 +73,7 @@ def load_json(text: str, path: Path) -> Any:
         return found
 
     try:
-        return json.loads(text, object_pairs_hook=unique)
+        return json.loads(_COMMENT.sub("", text), object_pairs_hook=unique)
     except (ValueError, RecursionError) as error:
         message = f"not valid JSON ({' '.join(str(error).split())[:100]})"
         raise DvoError(message, file=path, field="calibration", remedy=EXPECTED) from None
@@ -203,3 +206,41 @@ def load_ost(text: str, path: Path) -> Any:
             if isinstance(value, list):
                 part[key] = value[0][0] if len(value) == 1 and len(value[0]) == 1 else value
     return found
+
+
+def is_ini(text: str) -> bool:
+    """True for text whose first line is a ``[section]``.
+
+    Args:
+        text: of the file.
+    """
+    lines = map(str.strip, text.splitlines())
+    first = next((line for line in lines if line and line[0] not in "#;"), "")
+    return _SECTION.fullmatch(first) is not None
+
+
+def load_ini(text: str, path: Path) -> Any:
+    """Parse ``[sections]`` of ``name = value``; values that are JSON or texts.
+
+    Args:
+        text: of the file.
+        path: file that it comes from, for messages.
+
+    Raises:
+        DvoError: lines of another form, or a name twice.
+    """
+    parser = configparser.RawConfigParser(inline_comment_prefixes=("#", ";"), allow_no_value=True)
+    parser.optionxform = str  # type: ignore[assignment, method-assign]
+    try:
+        parser.read_string(text)
+    except configparser.Error as error:
+        message = f"not understood ({' '.join(error.message.split())[:120]})"
+        raise DvoError(message, file=path, field="calibration", remedy=EXPECTED) from None
+    return {name: {key: _of_option(value) for key, value in parser.items(name)} for name in parser.sections()}
+
+
+def _of_option(text: str | None) -> Any:
+    try:
+        return json.loads(text or "null")
+    except (ValueError, RecursionError):
+        return _of_text(text or "")

@@ -16,7 +16,7 @@ _NAMES: dict[DistortionModel, str] = {
     "none": "none pinholenodistortion rectified linear undistorted nodistortion ideal",
     "radtan": "radtan radtan4 radtan5 radtan8 radialtangential radialtangential8 plumbbob opencv fullopencv brown "
     "brownconrady rationalpolynomial rational pinholeradtan pinholeradtan8 pinholeradialtangential thinprism "
-    "rationalthinprism radial simpleradial",
+    "rationalthinprism radial simpleradial pinholefull",
     "fisheye": "fisheye equidistant equi kannalabrandt kannalabrandt4 kannalabrandt8 kb kb4 kb8 opencvfisheye "
     "pinholeequidistant pinholeequi pinholefisheye equidistantfisheye kannala",
     "ucm": "ucm unified unifiedcameramodel",
@@ -71,7 +71,7 @@ _OTHER = re.compile(  # keys that speak of something else though they have such 
     r"covar|sigma|weight|optical_?flow|optimi|criteria|aspect|rms|imu|gyro|acc)"
 )
 _BENIGN = re.compile(  # lists of as many numbers as a lens may have coefficients
-    r"(^t$|^t_|^tf|transf|extrin|^r$|^r_|^r\d|rot|rect|^p$|^p_|^p\d|^q(_|$)|proj|trans|quat|pose|posit|orient|roi|crop|imu|"
+    r"(^t_|^r?t[a-z]{0,2}$|_to_|[a-z]2[a-z]|^tf|transf|extrin|^r$|^r_|^r\d|rot|rect|^p$|^p_|^p\d|^q(_|$)|proj|trans|quat|pose|posit|orient|roi|crop|imu|"
     r"body|accel|gyro|noise|bias|grav|euler|rpy|xyz|error|reproj|view|std|cov|shift|rate|mask|border|bound|colou?r|rgb|"
     r"scale|offset|mean|backgr|window|grid|pattern|board|square|overlap|center|centre|viewer|line|point|range|depth|"
     r"size|resol|shape|time|stamp|frame|matrix|ids?$|aabb|box|plane|white|exposure|gain|norm)"
@@ -156,6 +156,8 @@ def looks_like_a_lens(key: str, value: Any) -> bool:
     if _WORDS.search(name) or name in _WHOLE or bare(name) in _WHOLE or "dist" in parts or "dist" in parts[-1][:4]:
         return True
     numbers = _flat(value)
+    if name in ("k", "ks", "p", "ps") and isinstance(value, list) and numbers is not None:  # no matrix
+        return len(numbers) <= (6 if name[0] == "k" else 2)
     if numbers is not None and len(numbers) <= 3:
         return _SCALAR.fullmatch(name) is not None
     return numbers is not None and len(numbers) in (4, 5, 8, 12, 14) and not _BENIGN.search(name)

@@ -38,16 +38,19 @@ _BUILT_IN = {
     "toml": "dvo.data.calibration.values:TOML",
     "json": "dvo.data.calibration.values:JSON",
     "yaml": "dvo.data.calibration.values:DIALECT",
+    "ini": "dvo.data.calibration.values:INI",
     "text": "dvo.data.calibration.text:DIALECT",
 }
 DIALECTS = Registry("calibration dialect", "dvo.calibration_dialects", dict(_BUILT_IN))
 """Names to ``"module:DIALECT"``, each a :class:`dvo.data.calibration.calibration.Dialect`. Those of other packages come
 first, because ``text`` takes any file."""
 _NUMBERED = frozenset(["numpy", "colmap", "kitti raw", "meshroom", "openmvg", "matlab", "middlebury", "realsense",
-                       "depthai", "zed", "metashape", "toml", "json", "yaml", "xml"])  # fmt: skip
+                       "depthai", "zed", "metashape", "toml", "ini", "json", "yaml", "xml"])  # fmt: skip
 """Those that may have several cameras."""
 SHORTEST = 0.01
 """Focal length at least, widths of the images: below it, it is no number of pixels."""
+TANGENTIAL = 0.05
+"""Largest tangential coefficients: those of lenses are below 0.01."""
 _UNSTATED = 100
 """Width that is assumed for this where the file states none."""
 _BINARY = (".bin", *SUFFIXES)
@@ -111,6 +114,13 @@ def read_calibration(path: Path | str) -> Calibration:
         LENSES[calibration.model].check(calibration.coefficients, calibration.model)
     except DvoError as error:
         raise DvoError(error.message, file=path, field=error.field, remedy=error.remedy or EXPECTED) from None
+    tangential = calibration.coefficients[2:4] if calibration.model == "radtan" else ()
+    if max(map(abs, tangential), default=0.0) > TANGENTIAL:
+        note = (
+            f"p1 and p2 of {tangential[0]:g} and {tangential[1]:g} are those of no usual lens: are they k3 and k4 of a "
+            "fisheye, or coefficients in another order than k1 k2 p1 p2 k3?"
+        )
+        calibration = replace(calibration, notes=(*calibration.notes, note))
     if not calibration.width and max(abs(calibration.cx), abs(calibration.cy)) <= 1:
         raise DvoError(
             f"a principal point of ({calibration.cx:g}, {calibration.cy:g}), as if it were a share of the size",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,16 @@ from dvo.core.errors import DvoError
 from dvo.data.calibration import entries as fields
 from dvo.data.calibration.calibration import EXPECTED, Calibration, Dialect
 from dvo.data.calibration.colmap_cameras import CORNER
-from dvo.data.calibration.documents import is_ost, load_documents, load_json, load_ost, load_toml, load_xml
+from dvo.data.calibration.documents import (
+    is_ini,
+    is_ost,
+    load_documents,
+    load_ini,
+    load_json,
+    load_ost,
+    load_toml,
+    load_xml,
+)
 from dvo.data.calibration.entries import Entries
 from dvo.data.calibration.lens_names import PINHOLE, bare, is_flag, looks_like_a_lens, model_of, says_nothing
 from dvo.geometry.camera import DistortionModel
@@ -42,8 +51,13 @@ _TANGENTIAL = tuple(name.replace("radial", "tangential") for name in _RADIAL)
 _FISHEYE_FLAGS = ("fisheyemodel", "isfisheye", "fisheye", "usefisheye", "bfisheye")
 _RADTAN_FLAT = LENSES["radtan"].names
 _FIRST = ("cam0", "camera0", "camera", "camera1", "left", "leftcamera", "cameraleft", "camleft", "0", "l", "1", "color",
-          "colour", "rgb", "rgbcamera", "cam", "cam1", "camleftrect", "leftcam", "00", "02")  # fmt: skip
+          "colour", "rgb", "rgbcamera", "colorcamera", "colourcamera", "cameracolor", "camerargb", "colorintrinsics",
+          "rgbintrinsics", "colorcam", "rgbcam", "colorsensor", "rgbsensor", "cam", "cam1", "camleftrect", "leftcam",
+          "00", "02")  # fmt: skip
 _IF_ZERO = ("inversebrownconrady", "modifiedbrownconrady")  # RealSense: models without coefficients as a rule
+_SENSORS = frozenset(["gray", "grey", "rgb", "color", "colour", "mono", "monocular", "stereo", "graydepth", "rgbdepth",
+                      "rgbd", "usb", "csi", "global", "rolling", "globalshutter", "rollingshutter"])  # fmt: skip
+"""Kinds of cameras that say nothing of their lens."""
 _UNIT = frozenset(["unit", "units", "focalunit", "focallengthunit", "focalunits", "focallengthunits"])
 _OTHER_UNITS = ("mm", "millimeter", "millimeters", "millimetre", "millimetres", "normalized", "normalised", "relative")
 _SENSOR = frozenset(["sensorwidth", "sensorwidthmm", "sensorsize", "sensorsizemm", "sensor", "pixelsize", "pixelpitch",
@@ -55,7 +69,9 @@ _BRACE = re.compile(r'\s*\{\s*"')
 _PAIRED = re.compile(r"(k|m|(?:camera_?)?matrix|camera_?mat|mtx|intrinsics?)_?(left|right|l|r|[0-2]|0[0-3])")
 _REGION = ("x_offset", "y_offset", "width", "height")
 _RECORDED = re.compile(r"^(?:original|orig|raw|distorted)|(?:original|orig|raw|(?<!un)distorted)$")
+_OF_OTHERS = re.compile(r"depth|infrared|(?<![a-z])ir(?![a-z])|thermal|(?<![a-z])tof(?![a-z])", re.IGNORECASE)
 _SUFFIX = re.compile(r"(.+?)_?(left|right|l|r|[0-2]|0[0-3])")
+_LED = re.compile(r"(left|right|cam(?:era)?_?[0-3])_(k|(?:camera_?)?matrix|camera_?mat|mtx|intrinsics?)")
 
 
 def from_matrix(matrix: np.ndarray, path: Path) -> Calibration:
@@ -74,6 +90,9 @@ def from_matrix(matrix: np.ndarray, path: Path) -> Calibration:
         matrix = matrix[:3, :3] if not any(outside) and (not is_square or matrix[3, 3] == 1) else np.zeros((0, 0))
     if matrix.shape == (3, 3) and not matrix[:2, 2].any() and matrix[2, :2].all() and matrix[2, 2] == 1:
         matrix = matrix.T  # Open3D, ARKit and MATLAB write columns
+    if matrix.size and not matrix.any():
+        raise DvoError("a matrix of zeros: the camera is not calibrated", file=path, field="intrinsics",
+                       remedy="calibrate it, dvo calibrate --board")  # fmt: skip
     if matrix.shape != (3, 3) or matrix[1, 0] != 0 or (matrix[2] != [0, 0, 1]).any():
         raise DvoError("not a pinhole matrix K", file=path, field="intrinsics", remedy=EXPECTED)
     _refuse_skew(float(matrix[0, 1]), float(matrix[0, 0]), path, "intrinsics")
@@ -107,8 +126,14 @@ def from_values(data: Any, path: Path, camera: int | None = None) -> Calibration
         raise DvoError("no keys in it", file=path, field="intrinsics", remedy=EXPECTED)
     found = [fields.cameras(_split(document), path) for document in mappings]
     read = [_calibration(_choose(named, camera, path), path) for named in found if named]
+    only = [named[0][0] for named in found if len(named) == 1]
+    if len(read) == 1 and camera is None and only and (kind := _OF_OTHERS.search(only[0])):
+        note = f"the only camera in it is {only[0]}: is that the camera of the images, or of {kind[0].lower()}?"
+        read = [replace(read[0], notes=(*read[0].notes, note))]
     if not read:
-        raise DvoError(_missing(mappings), file=path, field="intrinsics", remedy=EXPECTED)
+        other = _in_other_terms(mappings)
+        remedy = EXPECTED if other is None else f"give fx = fy = {other}, cx = (width - 1) / 2, cy = (height - 1) / 2"
+        raise DvoError(_missing(mappings), file=path, field="intrinsics", remedy=remedy)
     if any(other != read[0] for other in read[1:]):
         message = f"a list of {len(read)} cameras that differ"
         raise DvoError(message, file=path, field="intrinsics", remedy="leave that of the images in it")
@@ -129,8 +154,28 @@ def _missing(mappings: Sequence[dict[str, Any]]) -> str:
     return f"no fx, fy, cx, cy in it, nor a camera matrix{named}"
 
 
+def _in_other_terms(mappings: Sequence[dict[str, Any]]) -> str | None:
+    """Focal length in pixels of a file of a simulator or a renderer, by an angle or in millimetres; None for others."""
+    keys = {bare(str(key)) for mapping in mappings for key in _keys(mapping)}
+    if any(key.startswith(("fov", "hfov", "fieldofview", "anglex", "xfov", "horizontalfov")) for key in keys):
+        return "width / 2 / tan(horizontal angle / 2), or height / 2 / tan(vertical angle / 2)"
+    if keys & _SENSOR and any("lens" in key or "focal" in key for key in keys):
+        return "focal length / width of the sensor * width"
+    return None
+
+
+def _keys(value: Any) -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield str(key)
+            yield from _keys(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from _keys(item)
+
+
 def _split(value: Any) -> Any:
-    """The tree with ``K_left`` and ``D_left``, or ``M1`` and ``D1``, as entries of ``left`` and ``1``."""
+    """The tree with ``K_left`` and ``D_left``, ``left_K``, or ``M1`` and ``D1``, as entries of ``left`` and ``1``."""
     if isinstance(value, list):
         return [_split(item) for item in value]
     if not isinstance(value, dict):
@@ -138,10 +183,14 @@ def _split(value: Any) -> Any:
     found: dict[str, Any] = {}
     matrices = [str(key).lower() for key, item in value.items() if isinstance(item, list) and len(item) in (3, 4, 9)]
     paired = {parts[2] for key in matrices if (parts := _PAIRED.fullmatch(key))}
+    led = {parts[1] for key in matrices if (parts := _LED.fullmatch(key))}
     for key, item in value.items():
-        parts = _SUFFIX.fullmatch(str(key).lower())
+        name = str(key).lower()
+        parts, head = _SUFFIX.fullmatch(name), next((head for head in led if name.startswith(f"{head}_")), None)
         if parts and isinstance(item, list) and parts[2] in paired and not isinstance(found.get(parts[2], {}), list):
             found.setdefault(parts[2], {})[parts[1]] = item
+        elif head is not None and isinstance(found.get(head, {}), dict):
+            found.setdefault(head, {})[name[len(head) + 1 :]] = item
         elif bare(str(key)) == "calibration" and _is_row(item) and not {"intrinsics", "coefficients"} & set(value):
             found |= {"intrinsics": item[:4], "coefficients": item[4:]}  # MASt3R-SLAM
         elif bare(str(key)) == "roi" and isinstance(item, dict) and set(_REGION) <= set(item):
@@ -211,7 +260,10 @@ def _calibration(entries: Entries, path: Path) -> Calibration:
         _refuse_skew(float(skew.ravel()[0]), 1.0, path, "skew")
     if model != "none":
         told = entries.entry("distorted", "isdistorted", "hasdistortion")
-        if told is not None and says_nothing(told.value):
+        other = entries.entry("undistorted", "isundistorted", "rectified", "isrectified")
+        if other is not None and is_flag(other.value) and not says_nothing(other.value):
+            told = other
+        if told is not None and (told is other or says_nothing(told.value)):
             message = f"{str(told.value).lower()}, but there are coefficients of a lens"
             raise DvoError(message, file=path, field=told.name, remedy="leave what is true of the images")
         matrix = next((one for one in entries.found if one.used and "newcameramatrix" in one.calls), None)
@@ -331,20 +383,31 @@ def _size(entries: Entries, path: Path) -> tuple[int | None, int | None]:
 
 
 def _cropped(calibration: Calibration, entries: Entries, path: Path) -> Calibration:
-    """Of the region that is read out of the sensor (ROS, ``roi``): K and size are those of the whole one."""
+    """Of what ROS reads out of the sensor (``roi``, ``binning_x``): K and size are those of the whole one."""
+    bins = [_binning(entries, f"binning{axis}", path) for axis in "xy"]
     numbers = entries.numbers("regionofsensor", shape="list")
-    if numbers is None or numbers.shape != (4,):
-        return calibration
-    left, top, width, height = numbers.tolist()
+    left, top, width, height = (0.0, 0.0, 0.0, 0.0) if numbers is None or numbers.shape != (4,) else numbers.tolist()
     if not (width > 0 and height > 0):  # the whole sensor
-        return calibration
+        left, top, width, height = 0.0, 0.0, calibration.width or 0, calibration.height or 0
     outside = calibration.width and calibration.height and (
         left + width > calibration.width or top + height > calibration.height
     )  # fmt: skip
     if min(left, top) < 0 or outside or any(number != int(number) for number in (left, top, width, height)):
         raise DvoError("a region beyond the image", file=path, field="roi", remedy="leave it out, or mend it")
-    cx, cy = calibration.cx - left, calibration.cy - top
-    return replace(calibration, cx=cx, cy=cy, width=int(width), height=int(height))
+    return replace(  # as image_geometry of ROS
+        calibration, fx=calibration.fx / bins[0], fy=calibration.fy / bins[1], cx=(calibration.cx - left) / bins[0],
+        cy=(calibration.cy - top) / bins[1], width=int(width) // bins[0] or None, height=int(height) // bins[1] or None,
+    )  # fmt: skip
+
+
+def _binning(entries: Entries, name: str, path: Path) -> int:
+    """Pixels of the sensor to one of the images; ROS has 0 for 1 too."""
+    value = entries.take(name, shape="scalar")
+    if value in (None, 0):
+        return 1
+    if not isinstance(value, int | float) or not (1 <= value <= 64 and value == int(value)):
+        raise DvoError("no number of pixels", file=path, field=f"binning_{name[-1]}", remedy="give 1, 2, ...")
+    return int(value)
 
 
 def _with_sensors(calibration: Calibration, entries: Entries, path: Path) -> Calibration:
@@ -388,6 +451,8 @@ def _model(entries: Entries, path: Path) -> DistortionModel | None:
                 continue
             if isinstance(entry.value, int | float) and not _has_lens(entries):
                 continue  # Record3D: which of the phone's cameras
+            if key == "cameratype" and bare(str(entry.value)) in _SENSORS:
+                continue  # OKVIS 2: gray
             model = model_of(entry.value)
             if model is None and bare(str(entry.value)).removeprefix("distortion") in _IF_ZERO:
                 lists = [one.value for one in entries.found if set(_COEFFICIENTS) & set(one.calls)]
@@ -441,7 +506,7 @@ def _lens(entries: Entries, before: list[float], path: Path) -> tuple[Distortion
     model = _model(entries, path)
     values = _apart(entries, path) if model in (None, "radtan") else []
     listed = None if values else entries.entry(*_COEFFICIENTS, shape="list") or _single(entries)
-    if model is None:
+    if model is None and not _is_pinhole(entries):
         model = _wide_by_keys(entries)
     if listed is not None and model in (None, "radtan") and bare(listed.key).startswith("radial"):
         listed.used, listed = False, None  # none of them is tangential
@@ -459,13 +524,15 @@ def _lens(entries: Entries, before: list[float], path: Path) -> tuple[Distortion
     if before:
         raise DvoError(f"{4 + len(before)} intrinsics of the model {model or 'pinhole'}", file=path, field="intrinsics",
                        remedy=EXPECTED)  # fmt: skip
-    if model in ("thin_prism_fisheye", "fisheye624"):
-        keyed = [] if values else _scalars(entries, path, *LENSES[model].names, zeros=True)
-        return model, _trimmed(model, values or keyed, path)
     if model == "fisheye":
         return "fisheye", _trimmed("fisheye", values or _flat_fisheye(entries, path), path)
     if model == "none":
         return "none", _trimmed("none", values, path)
+    if model not in (None, "radtan"):
+        keyed = [] if values else _scalars(entries, path, *LENSES[model].names, zeros=True)
+        return model, _trimmed(model, values or keyed, path)
+    if model is None and not values:
+        _refuse_four_radial(entries, path)
     kept = _trimmed("radtan", values or _flat_radtan(entries, path), path)
     return ("radtan", kept) if any(kept) else ("none", ())
 
@@ -492,6 +559,12 @@ def _single(entries: Entries) -> Any:
         entry.used = False
         return None
     return entry
+
+
+def _is_pinhole(entries: Entries) -> bool:
+    """True for a file that names a pinhole camera, whose ``xi`` would be a contradiction."""
+    return any(model_of(one.value) == PINHOLE for one in entries.found if one.used and set(_MODEL_KEYS) & set(one.calls)
+               and isinstance(one.value, str) and one.value.strip())  # fmt: skip
 
 
 def _wide_by_keys(entries: Entries) -> DistortionModel | None:
@@ -536,6 +609,16 @@ def _flat_radtan(entries: Entries, path: Path) -> list[float]:
         return values + [0.0] * (4 - len(values)) if values else []
     used = next(count for count in (4, 5, 8, 12) if not any(values[count:]))
     return values[:used]
+
+
+def _refuse_four_radial(entries: Entries, path: Path) -> None:
+    """Refuse ``k1`` to ``k4`` alone, which are those of a fisheye as likely as not."""
+    stated = {name for name in (*_RADTAN_FLAT[:8], "xi", "alpha") for one in entries.found if name in one.calls}
+    k4 = entries.numbers("k4", shape="scalar") if stated == {"k1", "k2", "k3", "k4"} else None
+    if k4 is not None and k4.any():
+        message = "k1 to k4 without p1 and p2, and no lens model is named"
+        remedy = "write 'model: fisheye', or p1 and p2 too if they are those of radtan"
+        raise DvoError(message, file=path, field="k4", remedy=remedy)
 
 
 def _trimmed(model: DistortionModel, values: Sequence[float], path: Path) -> tuple[float, ...]:
@@ -586,4 +669,7 @@ XML = Dialect(
 )
 OST = Dialect(
     lambda path, text: is_ost(text), lambda path, text, camera: from_values(load_ost(text, path), path, camera)
+)
+INI = Dialect(
+    lambda path, text: is_ini(text), lambda path, text, camera: from_values(load_ini(text, path), path, camera)
 )

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration
@@ -20,6 +23,9 @@ from dvo.data.sensors.depth import read_depth
 from dvo.data.sensors.sensors import MILLIMETRES
 from dvo.data.source import Source
 
+_LOOKED_AT = 5  # frames, of which the first with depth tells the range
+_FARTHEST, _NEAREST = 100.0, 0.15
+"""Metres: a depth image nine tenths of which are farther, or nearer, is in another unit, or that of no usual scene."""
 _KIND = CompanionKind("depth images", "--depth", "16-bit PNG files", (".npy", ".npz"))
 
 
@@ -70,8 +76,10 @@ def with_depth(
             other = depth_camera(recording, topic, source.calibration)
             changes |= {} if other is None else {"depth_calibration": other}
         decode = partial(decode_depth, scale=scale or MILLIMETRES)
-        return source.changed(
-            stages=(*source.reading.stages, CompanionTopic(recording, topic, "depth", decode)), **changes
+        return _in_doubt(
+            source.changed(
+                stages=(*source.reading.stages, CompanionTopic(recording, topic, "depth", decode)), **changes
+            )
         )
     path = None if depth is None else locate(depth, source.path, "depth")
     own = recording.sensors.depth if isinstance(recording, ImageRecording) else None
@@ -87,4 +95,37 @@ def with_depth(
         if inside and isinstance(recording, ImageRecording):
             usual = recording.sensors.depth_scale or usual
     stage = CompanionFiles("depth", file, partial(read_depth, scale=scale or usual))
-    return source.changed(stages=(*source.reading.stages, stage), **changes)
+    return _in_doubt(source.changed(stages=(*source.reading.stages, stage), **changes))
+
+
+def depth_range(source: Source) -> tuple[float, float] | None:
+    """Depth of the nearest and of the farthest tenth of the first depth image, in metres.
+
+    Args:
+        source: whose frames have depth; it is read from its beginning.
+
+    Returns:
+        None for a source without depth, or without a readable one among the first frames; and for a stream, which is
+        read once.
+    """
+    has_depth = any(getattr(stage, "field", None) == "depth" for stage in source.reading.stages)
+    if type(source) is not Source or not has_depth:
+        return None
+    try:
+        found = (frame.depth for frame in islice(source.changed(), _LOOKED_AT))
+        first = next((depth[np.isfinite(depth)] for depth in found if depth is not None), np.zeros(0))
+    except DvoError:  # that is told when it is read for the poses
+        return None
+    return (float(np.quantile(first, 0.1)), float(np.quantile(first, 0.9))) if len(first) else None
+
+
+def _in_doubt(source: Source) -> Source:
+    """The source with a note on depth in what looks like another unit than metres."""
+    span = depth_range(source)
+    if span is None or (span[0] < _FARTHEST and span[1] > _NEAREST):
+        return source
+    note = (
+        f"most of the depth is {span[0]:.4g} to {span[1]:.4g} m: is it in another unit? Images of integers have "
+        "--depth-scale, those of floats must be metres"
+    )
+    return source.changed(doubts=(*source.reading.doubts, note))

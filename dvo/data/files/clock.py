@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.core.errors import DvoError
 from dvo.data.files.files import MAX_NUMBER, fields_of, read_lines
 
 PARTS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
@@ -29,6 +30,8 @@ _POSE_SECONDS = 1000.0  # of poses, which may be those of keyframes
 _EVEN = 0.25  # share of the usual interval that a camera keeps
 _SLOWEST = 2.0  # seconds: an interval above it is one of a finer unit
 _COUNTER = 10.0  # largest interval of numbers that count images
+_LEAST = 8  # times that show a pattern
+_SHORTEST = 1e-3  # seconds between images
 _DIGITS = 19  # of an integer of 64 bits
 _TICKS = 10**7  # a second, of Windows and .NET
 _TICK_EPOCHS = (11_644_473_600, 62_135_596_800)  # seconds from the years 1601 and 1 to 1970
@@ -58,11 +61,13 @@ class Clock:
         seconds: ``(N,)`` float64; NaN of a row that holds no time.
         unit: of the numbers, a key of :data:`NAMES`.
         column: of a table that they stand in, from 0.
+        zeros: fractions of seconds were written without their leading zeros.
     """
 
     seconds: np.ndarray
     unit: str
     column: int = 0
+    zeros: bool = False
 
     def note(self, origin: str) -> str | None:
         """Sentence about an interpretation that a person should see; None for plain seconds.
@@ -71,6 +76,8 @@ class Clock:
             origin: what the times come from.
         """
         where = f", column {self.column + 1}" if self.column else ""
+        if self.zeros:
+            return f"fractions of seconds of {origin} have lost their leading zeros, and are read with them"
         if self.unit == "s" and not where:
             return None
         text = f"times of {origin}{where} are taken for {NAMES[self.unit]}"
@@ -130,7 +137,7 @@ def read_table(path: Path, remedy: str, field: str | None = None) -> Table:
 
 def _is_header(fields: Sequence[str]) -> bool:
     """True for words alone; ``nan`` and numbers out of bounds are none."""
-    return not any(is_number(field) for field in fields) and parse_date(" ".join(fields[:2])) is None
+    return not any(is_number(field) for field in fields) and parse_date(" ".join(fields)) is None
 
 
 def parse_time(text: str) -> int | float:
@@ -202,6 +209,57 @@ def unit_of(values: Sequence[int | float], *, poses: bool = False) -> str:
     return next((unit for unit in ("ms", "us") if step / PARTS[unit] < _SLOWEST), "ns")
 
 
+def with_zeros(texts: Sequence[str]) -> list[float] | None:
+    """Seconds since 1970 of texts ``seconds.nanoseconds`` without the zeros that nanoseconds begin with.
+
+    Programs that put a point between two numbers write 7.000000003 as 7.3. Such times are uneven, and even with zeros.
+
+    Args:
+        texts: numbers, in any order.
+
+    Returns:
+        None for decimal numbers as they should be.
+    """
+    parts = [text.split(".") for text in texts]
+    if len(texts) < _LEAST or not all(len(part) == 2 and all(map(str.isdecimal, part)) for part in parts):
+        return None
+    digits = max(len(part[1]) for part in parts)
+    if digits not in (6, 9) or not all(len(part[0]) < _DIGITS and _is_epoch(int(part[0]), 1) for part in parts):
+        return None
+    padded = [int(whole) + int(rest) / 10**digits for whole, rest in parts]
+    if padded == (plain := [float(text) for text in texts]):
+        return None
+    uneven, even = (np.diff(np.sort(values)) for values in (plain, padded))
+    usual = float(np.median(even))
+    is_even = (even > 0.5 * usual).all() and float(np.quantile(even, 0.9)) < 2 * usual
+    return padded if is_even and even.std() < 0.5 * uneven.std() else None
+
+
+def refuse_lost_zeros(texts: Sequence[str], file: Path) -> None:
+    """Refuse times of a file whose fractions have lost their leading zeros, see :func:`with_zeros`.
+
+    Args:
+        texts: the times.
+        file: that they come from.
+
+    Raises:
+        DvoError: they have.
+    """
+    if with_zeros(texts) is not None:
+        message = "fractions of seconds that have lost their leading zeros, such as 7.3 for 7.000000003"
+        raise DvoError(message, file=file, field="times", remedy="write nanoseconds with nine digits")
+
+
+def unit_of_dates(values: Sequence[int | float] | np.ndarray) -> str | None:
+    """Unit in which numbers are dates of this age (since 1970); None for other numbers.
+
+    Args:
+        values: the numbers.
+    """
+    size = float(np.median(np.abs(np.array(values, dtype=np.float64)))) if len(values) else 0.0
+    return next((unit for unit, parts in PARTS.items() if _is_epoch(size, parts)), None)
+
+
 def in_seconds(values: Sequence[int | float], unit: str) -> np.ndarray:
     """Seconds of numbers in a unit.
 
@@ -258,12 +316,13 @@ def clock_of_rows(rows: Sequence[Sequence[str]], header: Sequence[str] | None = 
     if named is not None:
         column, unit, rest = named
         if rest is not None:
-            return _two(columns, column, rest)
+            return _two(columns, column, rest, parts_of(header or (), rest))
         values = _known(columns[column])
         return _clock(columns[column], unit or unit_of(values), column)
     column = _time_column(columns)
-    if _is_split(columns):
-        return _two(columns, 0, 1)
+    parts = _parts_of_rest(columns)
+    if parts is not None:
+        return _two(columns, 0, 1, parts)
     return _clock(columns[column] if columns else [None] * len(rows), None, column)
 
 
@@ -292,17 +351,22 @@ def clock_of_names(stems: Sequence[str]) -> Clock | None:
     varying = [k for k in range(len(fields[0])) if len({row[k] for row in fields}) > 1] or [0][: len(fields[0])]
     if len(varying) == 1 and varying[0]:
         pair = [varying[0] - 1, varying[0]]
-        varying = pair if _is_split([[_parsed(row[k]) for row in fields] for k in pair]) else varying  # in one second
+        rows = sorted(tuple(_parsed(row[k]) or 0 for k in pair) for row in fields)
+        varying = pair if _parts_of_rest(list(zip(*rows, strict=True))) else varying  # in one second
     columns = [[_parsed(row[k]) for row in fields] for k in varying]
     if not columns or any(value is None for column in columns for value in column):
         return None
     order = sorted(range(len(stems)), key=lambda i: tuple(column[i] for column in columns))
     ordered = [[column[i] for i in order] for column in columns]
-    if _is_split(ordered):
-        return Clock(_two(columns, 0, 1).seconds, "s")
+    parts = _parts_of_rest(ordered)
+    if parts is not None:
+        return Clock(_two(columns, 0, 1, parts).seconds, "s")
     if len(columns) > 2:
         return None
     chosen = _time_column(ordered)
+    mended = with_zeros([row[varying[chosen]] for row in fields])
+    if mended is not None:
+        return Clock(np.array(mended), "s", zeros=True)
     values = [value for value in ordered[chosen] if value is not None]
     unit = _unit_of_names(values, shapes == {"#"})
     return None if unit is None else Clock(_seconds(columns[chosen], unit), unit)
@@ -341,17 +405,28 @@ def named_times(header: Sequence[str]) -> tuple[int, str | None, int | None] | N
         header: names of the columns.
 
     Returns:
-        Column of the times, their unit if it is stated, and the column of the nanoseconds beside seconds, None for
-        none; None if no name is that of times.
+        Column of the times, their unit if it is stated, and the column of nano-, micro- or milliseconds beside seconds
+        (:func:`parts_of`), None for none; None if no name is that of times.
     """
     found = [k for k, name in enumerate(header) if is_time_name(name)]
     found.sort(key=lambda k: not {"header", "stamp"} <= set(_words(header[k])))  # of ROS, before that of arrival
     if not found:
         return None
     units = [unit_of_name(header[k]) for k in found]
-    if len(found) > 1 and units[:2] == ["s", "ns"] and not set(_words(header[found[0]])) & {"time", "timestamp"}:
+    is_whole = units[0] == "s" and not set(_words(header[found[0]])) & {"time", "timestamp"}
+    if len(found) > 1 and is_whole and units[1] in ("ns", "us", "ms"):
         return found[0], None, found[1]
     return found[0], units[0], None
+
+
+def parts_of(header: Sequence[str], column: int) -> int:
+    """How many of the unit of a column make a second.
+
+    Args:
+        header: names of the columns.
+        column: one whose name states its unit.
+    """
+    return PARTS[unit_of_name(header[column]) or "ns"]
 
 
 def is_time_name(name: str) -> bool:
@@ -392,10 +467,10 @@ def _clock(column: Sequence[int | float | None], unit: str | None, number: int) 
     return Clock(_seconds(column, unit), unit, number)
 
 
-def _two(columns: Sequence[Sequence[int | float | None]], whole: int, rest: int) -> Clock:
-    """Times of a column of seconds and one of nanoseconds."""
-    pairs = zip(columns[whole], columns[rest], strict=True)
-    joined = [None if a is None or b is None else int(a) * 10**9 + int(b) for a, b in pairs]
+def _two(columns: Sequence[Sequence[int | float | None]], whole: int, rest: int, parts: int) -> Clock:
+    """Times of a column of seconds and one of parts of them."""
+    pairs, factor = zip(columns[whole], columns[rest], strict=True), 10**9 // parts
+    joined = [None if a is None or b is None else int(a) * 10**9 + int(b) * factor for a, b in pairs]
     return Clock(_seconds(joined, "ns"), "s", whole)
 
 
@@ -429,17 +504,30 @@ def _time_column(columns: Sequence[Sequence[int | float | None]]) -> int:
     return 0
 
 
-def _is_split(columns: Sequence[Sequence[int | float | None]]) -> bool:
-    """True for a column of whole seconds since 1970, and one of the nanoseconds behind them."""
+def _parts_of_rest(columns: Sequence[Sequence[int | float | None]]) -> int | None:
+    """Parts of a second in a column behind one of whole seconds since 1970; None for other columns.
+
+    Nanoseconds, microseconds or milliseconds by the largest one. A number that counts the images of a second, or all of
+    them, is none.
+    """
     if len(columns) < 2 or len(columns[0]) < 2:
-        return False
+        return None
     whole, rest = columns[:2]
     if not all(isinstance(value, int) and _is_epoch(value, 1) for value in whole):
-        return False
+        return None
     if not all(isinstance(value, int) and 0 <= value < 10**9 for value in rest):
-        return False
-    joined = {int(a or 0) * 10**9 + int(b or 0) for a, b in zip(whole, rest, strict=True)}
-    return max(int(value or 0) for value in rest) > 10**6 and len(joined) == len(whole) > len(set(whole))
+        return None
+    pairs = [(int(a or 0), int(b or 0)) for a, b in zip(whole, rest, strict=True)]
+    if not len(set(pairs)) == len(pairs) > len(set(whole)):
+        return None
+    high = max(b for _, b in pairs)
+    parts = PARTS["ns" if high > 10**6 else "us" if high >= 10**3 else "ms"]
+    if parts == PARTS["ns"]:
+        return parts
+    steps = [second[1] - first[1] for first, second in zip(pairs, pairs[1:], strict=False) if first[0] == second[0]]
+    begins_anew = any(second[1] < first[1] for first, second in zip(pairs, pairs[1:], strict=False))
+    is_even = float(np.median(steps)) >= max(2.0, _SHORTEST * parts)
+    return parts if is_even and (begins_anew or 2 * high >= parts) else None
 
 
 def _unit_of_names(values: Sequence[int | float], bare: bool) -> str | None:

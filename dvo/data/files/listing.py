@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.clock import in_seconds, is_time_name, parse_time, unit_of
+from dvo.data.files.clock import in_seconds, is_time_name, parse_time, refuse_lost_zeros, unit_of
 from dvo.data.files.files import is_file, read_lines
 
 
@@ -66,6 +66,7 @@ def listed_files(
     """
     times: list[int | float] = []
     files: list[Path] = []
+    texts: list[str] = []
     for number, line in read_lines(listing, f"give a list of {what}"):
         fields = _pair(line.split("#")[0].strip(), column)
         if not fields:
@@ -80,6 +81,8 @@ def listed_files(
             ) from None
         files.append(listed_file(listing, folder or listing.parent, name, number))
         times.append(time)
+        texts.append(fields[0])
+    refuse_lost_zeros(texts, listing)
     order = sorted(range(len(times)), key=lambda row: times[row])
     ordered = [times[row] for row in order]
     return [files[row] for row in order], in_seconds(ordered, unit_of(ordered))

@@ -10,13 +10,24 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.clock import PARTS, Clock, in_seconds, named_times, parse_time, read_table, unit_of
+from dvo.data.files.clock import (
+    PARTS,
+    Clock,
+    in_seconds,
+    named_times,
+    parse_time,
+    parts_of,
+    read_table,
+    refuse_lost_zeros,
+    unit_of,
+)
 from dvo.data.files.files import MAX_NUMBER, parse_number, read_lines
 from dvo.geometry.poses import poses_from_matrices
 
 HEADER = "timestamp tx ty tz qx qy qz qw"
 _NUMBERS = 8
-_LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+_LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "ft": 0.3048, "feet": 0.3048, "in": 0.0254,
+            "inch": 0.0254, "um": 1e-6}  # fmt: skip
 _OTHERS = re.compile(r"v|vel|velocity|a|acc|accel|b|w|gyr|gyro|omega|lin|linear|ang|angular|bias|cov|sigma|std")
 
 
@@ -27,7 +38,8 @@ class _Columns:
     Attributes:
         time: column.
         unit: of the times, if the header states it.
-        nanoseconds: column of what is beyond whole seconds, None for none.
+        rest: column of what is beyond whole seconds, None for none.
+        parts: of a second in it.
         pose: columns of ``tx ty tz qx qy qz qw``.
         length: metres of a unit of the positions.
     """
@@ -36,7 +48,8 @@ class _Columns:
     unit: str | None
     pose: tuple[int, ...]
     length: float = 1.0
-    nanoseconds: int | None = None
+    rest: int | None = None
+    parts: int = PARTS["ns"]
 
 
 _TUM = _Columns(0, None, tuple(range(1, _NUMBERS)))
@@ -47,6 +60,7 @@ _JOINED = re.compile(  # before an axis: "posx"
     r"(?:pos|position|trans|translation|loc|location|tvec|coord|point|center|centre|gt|est|world|cam|camera|quat|"
     r"quaternion|rot|rotation|orient|orientation)$"
 )
+_BRACKETS = re.compile(r"[\[(]\s*([a-z]+)\s*[\])]")
 _OF_CAMERA = re.compile(r"(?:^|[^a-z])[tqrp]?_?(?:cw|c_w|w2c)(?:[^a-z]|$)")  # T_cw
 _IN_WORLD = re.compile(r"([tpq]_?[wxyz])_(?:world|odom|map)_[a-z]+")  # of Project Aria
 _RIGID = 0.02  # largest deviation of a rotation from an orthogonal matrix
@@ -110,8 +124,8 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
                 continue
             pose = [parse_number(text) for text in texts]
             time = parse_time(fields[columns.time])
-            if columns.nanoseconds is not None:
-                time = int(time) * PARTS["ns"] + int(parse_time(fields[columns.nanoseconds]))
+            if columns.rest is not None:
+                time = int(time) * PARTS["ns"] + int(parse_time(fields[columns.rest])) * (PARTS["ns"] // columns.parts)
             times.append(time)
         except (ValueError, IndexError):
             raise _no_row(path, line) from None
@@ -119,6 +133,7 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
         lines.append(line)
     if not poses:
         raise DvoError("no poses in it, all rows are NaN", file=path, remedy=f"give a file of rows '{HEADER}'")
+    refuse_lost_zeros([fields[columns.time] for fields in table.rows], path)
     unit = columns.unit or unit_of(times, poses=True)
     seconds, values = in_seconds(times, unit), np.array(poses, dtype=np.float64)
     beyond = np.flatnonzero(~(np.abs(seconds) <= MAX_NUMBER))
@@ -194,7 +209,7 @@ def _named(header: Sequence[str], path: Path) -> _Columns | None:
     Raises:
         DvoError: poses of the world in the camera, or of two trajectories.
     """
-    times, length = named_times(header), 1.0
+    times = named_times(header)
     found: dict[str, list[int]] = {}
     for k, cell in enumerate(header):
         if _OF_CAMERA.search(cell.lower()):
@@ -205,8 +220,6 @@ def _named(header: Sequence[str], path: Path) -> _Columns | None:
         part = _part(in_world[1] if in_world else name)
         if part is not None:
             found.setdefault(part, []).append(k)
-            unit = re.search(r"[\[(]\s*(mm|cm|m)\s*[\])]", cell.lower())
-            length = _LENGTHS[unit[1]] if unit and part == "tx" and len(found[part]) == 1 else length
     if times is None or len(found) < _NUMBERS - 1:
         return None
     if all(len(columns) > 1 for columns in found.values()):
@@ -214,8 +227,17 @@ def _named(header: Sequence[str], path: Path) -> _Columns | None:
         remedy = "leave the columns of one of them"
         raise DvoError(f"two trajectories, {both}", file=path, field="header", remedy=remedy)
     pose = tuple(found[part][0] for part in ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
-    column, unit_of_time, nanoseconds = times
-    return _Columns(column, "ns" if nanoseconds is not None else unit_of_time, pose, length, nanoseconds)
+    units = {_BRACKETS.search(header[k].lower()) for k in pose[:3]}
+    lengths = {_LENGTHS.get(unit[1], 1.0) if unit else 1.0 for unit in units}
+    if len(lengths) > 1:
+        names = ", ".join(header[k] for k in pose[:3])[:80]
+        remedy = "give all of them in metres"
+        raise DvoError(f"positions in several units: {names}", file=path, field="header", remedy=remedy)
+    (length,) = lengths
+    column, unit_of_time, rest = times
+    if rest is None:
+        return _Columns(column, unit_of_time, pose, length)
+    return _Columns(column, "ns", pose, length, rest, parts_of(header, rest))
 
 
 def _part(name: str) -> str | None:

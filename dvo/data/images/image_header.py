@@ -50,6 +50,31 @@ def holds_several(source: Path) -> bool:
         return False
 
 
+def no_image(source: Path) -> str | None:
+    """What a file is that has the name of an image and does not decode.
+
+    Args:
+        source: file.
+
+    Returns:
+        Words for people; None for what is not known.
+    """
+    try:
+        with source.open("rb") as file:
+            head = file.read(64)
+    except OSError:
+        return None
+    if not head:
+        return "empty"
+    if head.startswith(b"version https://git-lfs"):
+        return "a pointer of Git LFS (git lfs pull fetches the files)"
+    if head.lstrip().lower().startswith((b"<!doctype", b"<html")):
+        return "a web page"
+    kinds = {b"heic": "HEIC", b"heix": "HEIC", b"mif1": "HEIC", b"msf1": "HEIC", b"avif": "AVIF", b"avis": "AVIF"}
+    kind = kinds.get(head[8:12]) if head[4:8] == b"ftyp" else None
+    return None if kind is None else f"{kind}, which is not read"
+
+
 def white_value(source: Path) -> int | None:
     """The value of white that a PGM or PPM file states, where OpenCV leaves the pixels as they are stored.
 

@@ -21,9 +21,10 @@ SUFFIXES = frozenset(
 
 UNREAD = frozenset(
     {".heic", ".heif", ".avif", ".jxl", ".jp2", ".exr", ".hdr", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf",
-     ".rw2", ".gif"}
+     ".rw2", ".gif", ".tga", ".pcx", ".mpo", ".dpx", ".psd"}
 )  # fmt: skip
 """Endings of images that are not read: of phones, of cameras, and moving ones."""
+_NARROW = 16  # of the range of 16 bits, a part in which pixels have little contrast
 _LAST, _WRAPPED = 9999, 4  # number behind which cameras begin anew; files among which that is looked for
 _HEXADECIMAL = re.compile(r"[0-9a-f]+")
 
@@ -123,6 +124,27 @@ def few_bits(bits: int) -> str:
         bits: of :func:`used_bits`.
     """
     return f"the images of 16 bits hold {bits} bits: they are divided by {2 ** (bits - 8)}, not by 257"
+
+
+def narrow_range(images: Iterable[np.ndarray | None], bits: int) -> str | None:
+    """Note about images of 16 bits with little contrast, such as temperatures.
+
+    Args:
+        images: some of a recording, as decoded; None and others are passed over.
+        bits: that they use.
+
+    Returns:
+        A sentence; None where the pixels spread over more than a sixteenth of the range.
+    """
+    deep = [image for image in images if image is not None and image.dtype == np.uint16]
+    low = min((float(np.quantile(image, 0.01)) for image in deep), default=0.0)
+    high = max((float(np.quantile(image, 0.99)) for image in deep), default=0.0)
+    if not 0 < high - low < 2**bits / _NARROW:
+        return None
+    return (
+        f"most pixels of the images have levels from {low:.0f} to {high:.0f} of {2**bits - 1}, as of temperatures: "
+        "give images of 8 bits in which this range is stretched, in all of them alike"
+    )
 
 
 def to_rgb8(image: np.ndarray, bits: int = 16) -> np.ndarray:

@@ -30,6 +30,7 @@ _GYRO = re.compile(r"(?:.*(?:gyr|angular|rotation ?rate|gyrorotation|omega).*?|w
 _ACCEL = re.compile(r"(?:.*acc.*?|a ?(?:rs s )?|total ?acceleration.*?)([xyz])$")
 _G_FORCE = re.compile(r"g ?f(?:orce)? ?([xyz])$")
 _ROS = re.compile(r"(?:^| )linear acceleration [xyz]$")  # of sensor_msgs/Imu, with gravity
+_VEL, _ACC = re.compile(r"\bang(?:ular)? vel\b"), re.compile(r"\blin(?:ear)? acc(?:el)?\b")  # ang_vel_x, lin_acc_x
 _OTHER = re.compile(
     r"mag|grav|orient|quat|euler|bias|cov|temper|pos|vel(?!ocity)|attitude|^gps|drift|std|stdev|sigma|noise|delta|world|earth|"
     r"angular ?acc|incr"
@@ -105,7 +106,8 @@ def columns_of(header: Sequence[str], path: Path) -> dict[str, Columns]:
 def _plain(name: str) -> str:
     """Name in small letters, without unit, its index as an axis."""
     indexed = _INDEX.sub(lambda match: " " + "xyz"[int(match[1])], name)
-    return " ".join(re.sub(r"[._:-]", " ", _UNIT.sub("", indexed).lower()).split())
+    words = " ".join(re.sub(r"[._:/-]", " ", _UNIT.sub("", indexed).lower()).split())
+    return _ACC.sub("linear acceleration", _VEL.sub("angular velocity", words))
 
 
 def _rank(stem: str) -> int:

@@ -24,6 +24,7 @@ from dvo.data.calibration.euroc import read_extrinsics, read_rig
 from dvo.data.calibration.read import read_calibration
 from dvo.data.calibration.stereo import right_camera
 from dvo.data.extrinsics import pose_of_numbers
+from dvo.data.files.clock import NAMES, PARTS, unit_of_dates, unit_of_name
 from dvo.data.files.files import (
     is_file,
     is_folder,
@@ -85,7 +86,10 @@ def read_state_groundtruth(path: Path) -> Trajectory:
 
 
 def _timed_rows(path: Path, columns: int, header: str) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """``(N,)`` int64 nanoseconds, ``(N, columns)`` float64 numbers after them, and the lines of the rows."""
+    """``(N,)`` int64 nanoseconds, ``(N, columns)`` float64 numbers after them, and the lines of the rows.
+
+    Dates in another unit than nanoseconds, as some recorders write them, become nanoseconds.
+    """
     times, values, lines = array("q"), array("d"), array("q")
     for number, fields in read_rows(path, "use EuRoC's data.csv"):
         try:
@@ -99,8 +103,8 @@ def _timed_rows(path: Path, columns: int, header: str) -> tuple[np.ndarray, np.n
         times.append(time)
         values.extend(row)
         lines.append(number)
-    table = np.array(values, dtype=np.float64).reshape(-1, columns)
-    return np.array(times, dtype=np.int64), table, lines.tolist()
+    table, numbers = np.array(values, dtype=np.float64).reshape(-1, columns), np.array(times, dtype=np.int64)
+    return numbers * (PARTS["ns"] // PARTS[unit_of_dates(numbers) or "ns"]), table, lines.tolist()
 
 
 def read_inertial(path: Path, calibration: ImuCalibration | None = None) -> InertialSamples:
@@ -214,9 +218,11 @@ def _images(camera: Path, warnings: list[str]) -> tuple[list[Path], np.ndarray |
     if not listing.is_file():
         return camera_images(camera / "data", warnings), None
     rows = []
+    stated = None
     for number, line in read_lines(listing, "use EuRoC's data.csv"):
         fields = [field.strip() for field in line.split("#")[0].split(",")]
         if not fields[0]:
+            stated = stated or unit_of_name(line.split(",")[0])
             continue
         try:
             time, name = parse_nanoseconds(fields[0]), fields[1]
@@ -226,7 +232,10 @@ def _images(camera: Path, warnings: list[str]) -> tuple[list[Path], np.ndarray |
             ) from None
         rows.append((time, listed_file(listing, camera / "data", name, number)))
     rows.sort()
-    return [file for _, file in rows], np.array([time / 1e9 for time, _ in rows])
+    unit = unit_of_dates([time for time, _ in rows]) or stated or "ns"
+    if unit != "ns":
+        warnings.append(f"times of {camera.name}/data.csv are taken for {NAMES[unit]}")
+    return [file for _, file in rows], np.array([time / float(PARTS[unit]) for time, _ in rows])
 
 
 def open_euroc(path: Path, request: Request) -> Recording:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.core.text import visible
-from dvo.data.files.stamps import choose_times, times_from_names
+from dvo.data.files.stamps import choose_times, in_order, times_from_names
 from dvo.data.images.images import list_images
 from dvo.data.readers.groups import Streams, split_streams
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
@@ -108,11 +108,12 @@ def open_folder(path: Path, request: Request) -> Recording:
         streams.images, path, times=request.times, fps=request.fps, warnings=warnings,
         fallback=lambda: times_of_rows(request, len(streams.images), warnings),
     )  # fmt: skip
-    scale = REPLICA_SCALE if streams.depth is not None and _is_replica(streams.images[0]) else MILLIMETRES
+    images, times = in_order(streams.images, times)
+    scale = REPLICA_SCALE if streams.depth is not None and _is_replica(images[0]) else MILLIMETRES
     if scale == REPLICA_SCALE:
         warnings.append(f"laid out as the Replica renderings of NICE-SLAM: --depth takes {scale:g} units for a metre")
     sensors = Sensors(depth=streams.depth, depth_scale=scale, right=streams.right)
-    return ImageRecording("folder", path, streams.images, times, warnings=warnings, sensors=sensors)
+    return ImageRecording("folder", path, images, times, warnings=warnings, sensors=sensors)
 
 
 def _is_replica(image: Path) -> bool:

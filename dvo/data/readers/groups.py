@@ -31,6 +31,7 @@ _CAMERA = re.compile(
     r"(cam|camera|image|img|view|c|infra|infrared|ir|fisheye|sensor|lens|eye|device|dev|port|channel|ch|stream|stereo|mono|"
     r"gr[ae]y|rgb|colou?r)[_-]?$", re.IGNORECASE
 )  # fmt: skip
+_STAMP = 13  # digits of a date in milliseconds, or of a finer one: images that share it were taken at once
 _FEW = 8  # cameras whose numbers stand in names
 _LEAST = 2  # images of a stream
 _RECORDING = 4  # images of one of several recordings, at least
@@ -119,7 +120,8 @@ def _odd_names(images: Sequence[Path]) -> str | None:
 def _begun_anew(images: Sequence[Path]) -> str | None:
     """Note about names of several recordings, ``take1_0001.png`` and ``take2_0001.png``."""
     fields = [re.findall(r"[0-9]+", image.stem) for image in images]
-    if len({re.sub(r"[0-9]+", "*", image.stem) for image in images}) != 1 or len(fields[0]) != 2:
+    shapes = {re.sub(r"[0-9]+", "*", image.stem) for image in images}
+    if len(shapes) != 1 or len(fields[0]) != 2 or "*.*" in shapes.pop():  # a number with a decimal point
         return None
     starts = [k for k in range(1, len(fields)) if fields[k][0] != fields[k - 1][0]]
     blocks = [fields[start:end] for start, end in pairwise([0, *starts, len(fields)])]
@@ -211,7 +213,9 @@ def _varying(rows: list[tuple[str, ...]], count: int) -> list[tuple[str, ...]]:
 
 
 def _by_camera(images: Sequence[Path]) -> list[_Group]:
-    """Groups of names that differ in the number of a camera, at the end (``001_0``) or behind a word (``cam0_001``)."""
+    """Groups of names that differ in the number of a camera, at the end (``001_0``), behind a word (``cam0_001``), or
+    beside a date that they share (AirSim's ``img__5_1700000000000000000``).
+    """
     fields = [re.findall(r"[0-9]+", image.stem) for image in images]
     shapes = {re.sub(r"[0-9]+", "*", image.stem) + image.suffix for image in images}
     if len(images) < 2 * _LEAST or len(shapes) != 1 or len(fields[0]) < 2:
@@ -221,7 +225,10 @@ def _by_camera(images: Sequence[Path]) -> list[_Group]:
     for k in (last, *range(last)):
         values = sorted({row[k] for row in fields}, key=int)
         is_end = k == last and texts[-1] == "" and texts[k] in ("_", "-") and values in (["0", "1"], ["1", "2"])
-        if not 2 <= len(values) <= _FEW or not (is_end or _CAMERA.search(texts[k])):
+        is_camera = is_end or _CAMERA.search(texts[k]) is not None
+        others = [j for j, column in enumerate(zip(*fields, strict=True)) if j != k and len(set(column)) > 1]
+        is_simultaneous = bool(others) and all(len(row[j]) >= _STAMP for row in fields for j in others)
+        if not 2 <= len(values) <= _FEW or not (is_camera or is_simultaneous):
             continue
         groups = {value: _Group(_with(texts, k, value) + images[0].suffix, "plain") for value in values}
         for image, row in zip(images, fields, strict=True):
@@ -230,7 +237,7 @@ def _by_camera(images: Sequence[Path]) -> list[_Group]:
         found = list(groups.values())
         numbers = [set(group.numbers) for group in found]
         if all(len(numbers[0] & other) >= _COMMON * min(len(numbers[0]), len(other)) for other in numbers[1:]):
-            found[0].role, found[1].role = "left", "right"
+            found[0].role, found[1].role = ("left", "right") if is_camera else ("plain", "other")
             for group in found[2:]:
                 group.role = "other"
             return found

@@ -312,7 +312,8 @@ def calibration_of_info(info: Any, image: str, path: Path) -> Calibration:
     size = {key: getattr(info, key) for key in ("width", "height") if getattr(info, key)}
     roi = getattr(info, "roi", None)
     region = {key: getattr(roi, key, 0) for key in ("x_offset", "y_offset", "width", "height")}
-    return from_values({**values, **(size if len(size) == 2 else {}), "roi": region}, path)
+    binning = {key: getattr(info, key, 0) for key in ("binning_x", "binning_y")}
+    return from_values({**values, **(size if len(size) == 2 else {}), **binning, "roi": region}, path)
 
 
 def _messages(reader: Any, topic: str) -> Iterator[tuple[Any, int, bytes]]:

@@ -13,7 +13,7 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, rectified
 from dvo.data.calibration.read import read_calibration
-from dvo.data.files.stamps import choose_times
+from dvo.data.files.stamps import choose_times, in_order
 from dvo.data.images.images import has_images, natural_key
 from dvo.data.readers.folder import camera_streams, times_of_rows
 from dvo.data.readers.groups import Streams, choose_folder, others_beside
@@ -128,6 +128,7 @@ def open_sequence(path: Path, request: Request) -> Recording:
     times = choose_times(
         images, folder, times=request.times, fps=request.fps, warnings=warnings, fallback=times_of_groundtruth
     )
+    images, times = in_order(images, times)
     calibration = find_calibration(path)
     sensors = _sensors(path, folder, request.calibration or calibration, streams)
     used = [folder, *(one.folder for one in (sensors.depth, sensors.right) if isinstance(one, SameNumbers | SameName))]

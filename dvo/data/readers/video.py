@@ -24,7 +24,8 @@ from dvo.data.files.files import is_file, lookups
 from dvo.data.files.output import spelled_in_text
 from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
 from dvo.data.images.fields import DEINTERLACE, INTERLACED, LOOKED_AT, are_interlaced
-from dvo.data.images.image_header import MAX_PIXELS
+from dvo.data.images.halves import FLAT
+from dvo.data.images.image_header import MAX_PIXELS, holds_several
 from dvo.data.images.images import SUFFIXES, to_rgb8
 from dvo.data.images.orientation import MIRRORED, mirrors, oriented, turn
 from dvo.data.inertial import InertialSamples
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 # A damaged packet fails one grab, and the packets after it may be good; the end of the file fails every grab.
 # Half a minute of 30 Hz video without a frame is taken for the end.
 _GIVE_UP_AFTER = 900
+_FASTEST = 1000.0  # frames a second of a file: faster cameras write files to be played slowly
+_LATE = 3  # frames in a row that show that a clock was set back, as of parts put together
 _JUMP = 5000.0  # milliseconds: frames in another order than that of their times lie far less apart
 _HELD_BACK = 4  # frames that a codec needs before it gives the first one
 _BINARY = re.compile(rb"[^\t\n\r\x0c\x20-\x7e\x80-\xff]")
@@ -71,6 +74,9 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
         # FFmpeg would follow the names in it, or show the text itself
         raise DvoError("a text file is no video", file=path, remedy="give a video or the folder that holds the images")
     if path.suffix.lower() in SUFFIXES:  # FFmpeg would read it as a video of one frame
+        if holds_several(path):
+            remedy = "take its images apart into a folder, or make a video of it"
+            raise DvoError("an animated image, or one of several pages, is no video", file=path, remedy=remedy)
         raise DvoError("one image is no video", file=path, remedy="give the folder that holds the images")
     with ExitStack() as opened:
         capture = _open(path, opened)
@@ -140,7 +146,7 @@ def _no_video(path: Path, head: bytes) -> str | None:
 def _head(path: Path) -> bytes:
     """The first bytes, which tell the container."""
     with lookups(path), path.open("rb") as file:
-        return file.read(12)
+        return file.read(512)
 
 
 def _does_not_convert(path: Path) -> bool:
@@ -163,6 +169,14 @@ def _does_not_convert(path: Path) -> bool:
         except (OSError, subprocess.TimeoutExpired):
             return False
     return b"interlaced" in said
+
+
+def _is_without_rate(head: bytes) -> bool:
+    """True for an AVI file whose head states no frames a second."""
+    begin, stream = head.find(b"avih"), head.find(b"strh")
+    if not head.startswith(b"RIFF") or begin < 0 or not 0 <= stream <= len(head) - 36:
+        return False
+    return head[begin + 8 : begin + 12] == bytes(4) == head[stream + 32 : stream + 36]
 
 
 def _codec(code: float) -> str:
@@ -262,6 +276,7 @@ class VideoRecording:
             width, height = reversed(size) if self.orientation > 4 else size
             self._square = _square_size(width, height, _aspect(capture), self.turned, request.calibration)
             code = capture.get(cv2.CAP_PROP_FOURCC)
+            self._begins = 0.0  # frames that the times of the file begin behind
             first, interlaced = self._look(capture)
         head = _head(path)
         if not first:
@@ -269,6 +284,8 @@ class VideoRecording:
             raise DvoError(f"no frame of this video decodes{_codec(code)}", file=path, remedy=remedy)
         if interlaced and not head.startswith(b"GIF"):  # whose few colours may be a pattern of lines
             self.warnings.append(INTERLACED)
+        if head.startswith(b"\x1a\x45\xdf\xa3") and 0 < self._begins < announced:
+            announced -= self._begins  # Matroska states the end, from which the number is guessed
         # containers without a count give huge or negative numbers
         self.frame_count: int | None = int(announced) if 0 < announced < 1e9 else None
         if self._square is not None:
@@ -287,15 +304,18 @@ class VideoRecording:
         if is_sphere(path):
             message = "the file says that its images show all around (equirectangular, or the like)"
             if request.calibration is None:
-                remedy = "make a flat view of it: ffmpeg -i VIDEO -vf v360=e:flat:h_fov=90:v_fov=60 OUT.mp4"
-                raise DvoError(message, file=path, remedy=remedy)
+                raise DvoError(message, file=path, remedy=FLAT.format("VIDEO", ".mp4"))
             self.warnings.append(f"{message}: they are read as those of the calibration")
         shown = shown_seconds(path)
         if shown is not None and self.frame_count is not None and RATES[0] <= rate <= RATES[1]:
             # the frames before and behind what is shown are counted, and not decoded
             self.frame_count = max(1, min(self.frame_count, round(shown * rate)))
         self._times = self._read_times(request.times) if request.times is not None else None
-        self._use_container = bool(request.fps is None and (np.diff(first) > 0).all() and np.isfinite(first).all())
+        steps = np.diff(first)
+        is_hasty = len(steps) > 0 and 0 < float(steps.mean()) < 1000 / _FASTEST
+        self._use_container = bool(
+            request.fps is None and (steps > 0).all() and np.isfinite(first).all() and not is_hasty
+        )
         if has_telemetry(path):
             self.warnings += gopro_notes(path)
             self.positions = partial(read_gopro_positions, path)
@@ -305,17 +325,14 @@ class VideoRecording:
                 self.inertial = partial(read_gopro, path, self.turned)
             else:
                 self.warnings.append("inertial samples of the telemetry are not used: frames have no times of the file")
-        self._fps = fps or (rate if np.isfinite(rate) and RATES[0] <= rate <= RATES[1] else NOMINAL_FPS)
+        self._fps = fps or (rate if np.isfinite(rate) and RATES[0] <= rate <= _FASTEST else NOMINAL_FPS)
         self.rate = self._fps if self._times is None else None
-        is_stated = self._use_container and not head.startswith(
-            b"\xff\xd8"
-        )  # of JPEGs in a row FFmpeg gives 25 a second
+        is_stated = self._use_container and not (head.startswith(b"\xff\xd8") or _is_without_rate(head))  # 25 by FFmpeg
         self._is_counted = head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free") or head.startswith(b"RIFF")
         if self._times is None and not is_stated and request.fps is None:
             known = "the stated" if self._fps == rate else "a guessed"
-            self.warnings.append(
-                f"the video has no times: assuming {known} {self._fps:g} frames a second (or give --fps)"
-            )
+            what = f"states {rate:,.0f} frames a second" if is_hasty or rate > _FASTEST else "has no times"
+            self.warnings.append(f"the video {what}: assuming {known} {self._fps:g} frames a second (or give --fps)")
 
     def _look(self, capture: cv2.VideoCapture) -> tuple[list[float], bool]:
         """Times of the first three frames in milliseconds, and if those of the beginning are interlaced."""
@@ -327,6 +344,8 @@ class VideoRecording:
         def images() -> Iterator[np.ndarray]:
             nonlocal previous, repeats
             for _, milliseconds, _ in islice(_grabs(capture), LOOKED_AT):
+                if not times:
+                    self._begins = capture.get(getattr(cv2, "CAP_PROP_PTS", -1))
                 times.append(milliseconds)
                 decoded, image = capture.retrieve()
                 if decoded and image is not None:
@@ -356,16 +375,21 @@ class VideoRecording:
         import cv2
 
         read, last, previous, dropped, offset = 0, 0.0, -np.inf, 0, 0.0
+        latest, late = 0.0, 0  # milliseconds of the file; frames in a row that increase, but behind an earlier one
 
         def grabbed(capture: cv2.VideoCapture) -> Iterator[tuple[int, float]]:
-            nonlocal read, last, offset
+            nonlocal read, last, offset, latest, late
             for index, milliseconds, failed in _grabs(capture):
                 log.unreadable.extend(f"frame {number}" for number in range(index - failed, index))
-                if self._use_container and milliseconds + offset < last - _JUMP:
-                    offset = last + 1000 / self._fps - milliseconds
+                ahead = milliseconds + offset
+                late = 0 if ahead > last else late + 1 if milliseconds > latest or not late else 1
+                latest = milliseconds
+                if self._use_container and (ahead < last - _JUMP or late == _LATE):
+                    ahead, late = last + 1000 / self._fps, 0
+                    offset = ahead - milliseconds
                     log.notes.append(f"the clock was set back before frame {index}: times go on from there")
-                read, last = read + 1, milliseconds + offset
-                yield index, last
+                read, last = read + 1, max(last, ahead)
+                yield index, ahead
 
         with _capture(self.path) as capture:
             for index, milliseconds in selection.interval.select(
@@ -375,7 +399,7 @@ class VideoRecording:
                 if timestamp is None or not previous < timestamp < np.inf:  # NaN fails too
                     dropped += 1
                     if dropped == 1:
-                        log.notes.append(f"from frame {index} on, frames not later than the one before were dropped")
+                        log.notes.append(f"frames not later than the one before were dropped, first frame {index}")
                     continue
                 decoded, image = capture.retrieve()
                 if not decoded or image is None:

@@ -4,7 +4,7 @@ The beginning of a clip is tracked with a guess of the focal length, which is th
 (:mod:`dvo.odometry.global_ba.focal_length`); measurements made with a focal length far off are worse ones, so this is
 repeated with what was found, as long as no more frames are tracked than the clip has, and a few. The motion may not
 tell the focal length; then the guess is kept, and the result says so. The principal point is the middle of the image,
-unless the measurements tell it closely.
+and the lens has no distortion, unless the measurements tell them closely.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ from dvo.core.settings import check_settings
 from dvo.data.calibration.focal_guess import FocalGuess, guess_from_angle
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
-from dvo.odometry.calibration.camera_estimate import SELF_CALIBRATED, SelfCalibration, pinhole
+from dvo.geometry.camera import Camera
+from dvo.geometry.undistort import Undistorter
+from dvo.odometry.calibration.camera_estimate import SELF_CALIBRATED, SelfCalibration, simple_camera
 from dvo.odometry.frames.fixed_pixels import Bars
 from dvo.odometry.global_ba.focal_length import FocalProfile, find_focal
 from dvo.odometry.global_ba.self_calibration import adjust_segments
@@ -39,6 +41,8 @@ from dvo.odometry.protocol import Estimate, Status
 if TYPE_CHECKING:
     from dvo.odometry.patch.tracker import PatchOdometry
 
+_MENDED = 5.0  # times the contrast of the round before: its measurements are of another kind
+_LEFT = 0.5  # of a step of the focal length, at most, that the next round would take: measurements lean
 _FARTHEST_ASIDE = 0.1  # principal points further from the middle, in longer sides of the image, are not believed
 _RANGES = {
     "frames": (3, 10**6),
@@ -65,7 +69,8 @@ class CalibrationOptions:
             known any number.
         interval: seconds between frames, at least; of a faster camera frames are left out.
         settled: change of the logarithm of the focal length in a round below which it has settled; the principal point
-            has, once it moves by less than ``max_aside``.
+            has, once it moves by less than ``max_aside``, and the bend of the lens, once it changes by less than twice
+            this.
         min_contrast: increase of the cost at focal lengths a fifth off below which the motion does not tell.
         max_deviation: largest standard deviation of the logarithm of the focal length that is believed.
         inflation: factor of the standard deviation that the curvature of the cost gives; measurements of a patch in
@@ -106,7 +111,7 @@ def calibrate(
     on_frame: Callable[[Frame, Estimate | None], None] | None = None,
     on_round: Callable[[int, int, int], None] | None = None,
 ) -> SelfCalibration:
-    """Estimate the focal length of the camera that has recorded a clip.
+    """Estimate the camera that has recorded a clip: its focal length, barrel distortion and principal point.
 
     Args:
         frames: from the beginning of the clip: a :class:`dvo.data.Source`, or a list. Their cameras are not used, but
@@ -120,7 +125,8 @@ def calibrate(
             frames that it tracks if none is left out or lost.
 
     Returns:
-        The focal length with its standard deviation, or the guess if the images do not tell.
+        The focal length with its standard deviation, and the distortion of the lens if it has some, or the guess if the
+        images do not tell.
 
     Raises:
         DvoError: no frames, or weights of another architecture.
@@ -152,12 +158,13 @@ def calibrate(
         aside = aside[0] + picture.aside[0], aside[1] + picture.aside[1]
         return SelfCalibration(focal, deviation, source, width, height, count, reason, guess, aside, *more)
 
-    focal, aside, wanted, reason, count = guess.focal, (0.0, 0.0), options.frames, "", 0
-    walk: list[tuple[float, float]] = []
+    focal, aside, bend, wanted, reason, count = guess.focal, (0.0, 0.0), 0.0, options.frames, "", 0
+    walk: list[tuple[float, float, float]] = []
     known = length_hint(frames, -1)  # a source may not know it before it is read
     length = known if known >= 0 else None
     left = math.inf if length is None else length + options.spare
     tracking: _Tracking | None = None
+    believed: SelfCalibration | None = None
     for number in range(options.rounds):
         if on_round is not None:
             on_round(number + 1, options.rounds, int(min(wanted, left)))
@@ -165,30 +172,41 @@ def calibrate(
             clip = islice(_readable(frames if kept is None else copy(kept)), limit)
             x, y = (value * first.camera.width / width for value in aside)
             odometry = _loaded(weights, device, seed)
-            tracking = _Tracking(odometry, clip, focal * first.camera.width / width, (x, y), picture)
+            tracking = _Tracking(odometry, clip, focal * first.camera.width / width, (x, y), bend, picture)
         left -= tracking.go_on(wanted, options.interval, left, on_frame)
-        profile, count = _profile(tracking.odometry)
-        asked = [*walk, (math.log(focal), profile.minimum.value)]
+        profile, count = _profile(tracking.odometry, tracking.lens)
+        asked = [*walk, (math.log(focal), profile.minimum.value, profile.contrast)]
         slope = _slope(asked)
         step = profile.minimum.value / slope
         deviation = math.hypot(options.inflation * profile.minimum.deviation / slope, options.floor)
         reason = _doubt(profile, deviation, focal * math.exp(step), guess, options)
         is_last = number + 1 == options.rounds or left < min(wanted, math.inf if length is None else length) / 2
+        if reason and believed is not None and count < believed.frames:
+            return believed  # there were not frames enough left to settle
         if reason:
             if tracking.tracked < wanted or wanted > options.frames or is_last:
                 break
             if walk:  # back to the guess; tracked with it, the clip goes on from where it is
                 tracking = None
-            focal, aside, wanted, walk = guess.focal, (0.0, 0.0), 2 * wanted, []
+            focal, aside, bend, wanted, walk = guess.focal, (0.0, 0.0), 0.0, 2 * wanted, []
             continue
         tracking, walk = None, asked
         before, (aside, unsure) = aside, _principal_point(profile, aside, focal, max(width, height), options)
         focal *= math.exp(step)
+        bent, bend = profile.bend.value - bend, profile.bend.value
+        bend_deviation = math.hypot(options.inflation * profile.bend.deviation, bent) if bend else math.inf
         if abs(step) > options.settled:  # the last round may end without having settled
-            deviation = math.hypot(deviation, step)
-        is_settled = abs(step) <= options.settled and math.dist(before, aside) <= options.max_aside * max(width, height)
+            deviation = math.hypot(deviation, _LEFT * step)
+        is_settled = (
+            abs(step) <= options.settled
+            and abs(bent) <= 2 * options.settled
+            and math.dist(before, aside) <= options.max_aside * max(width, height)
+        )
+        believed = result(
+            focal, deviation * focal, SELF_CALIBRATED, count, "", guess, aside, unsure, bend, bend_deviation
+        )
         if is_settled or is_last:
-            return result(focal, deviation * focal, SELF_CALIBRATED, count, "", guess, aside, unsure)
+            return believed
     return result(guess.focal, guess.deviation, guess.source, count, reason, guess)
 
 
@@ -205,21 +223,21 @@ def _readable(frames: Iterable[Frame]) -> Iterator[Frame]:
             raise
 
 
-def _slope(walk: list[tuple[float, float]]) -> float:
+def _slope(walk: list[tuple[float, float, float]]) -> float:
     """Share of the way to the focal length at which the measurements ask for no further step, that they ask for.
 
     Measurements lean towards the focal length that they were tracked with, so that a step that they ask for is too
     short; so is the deviation of the focal length that they tell. The secant through the last two rounds tells by how
-    much.
+    much, unless the last one tells the focal length far better: then the one before was not tracked well.
 
     Args:
-        walk: logarithm of the focal length of each round, and the step that its measurements ask for.
+        walk: logarithm of the focal length of each round, the step that its measurements ask for, and their contrast.
 
     Returns:
         Divisor of the last step and its deviation, 0.4 to 1.
     """
-    (at, step) = walk[-1]
-    if len(walk) == 1 or at == walk[-2][0]:
+    (at, step, contrast) = walk[-1]
+    if len(walk) == 1 or at == walk[-2][0] or contrast > _MENDED * walk[-2][2]:
         return 1.0
     return min(max((walk[-2][1] - step) / (at - walk[-2][0]), 0.4), 1.0)
 
@@ -252,7 +270,11 @@ class _Picture:
 
 
 class _Tracking:
-    """Tracking of the beginning of a clip with a focal length."""
+    """Tracking of the beginning of a clip with a focal length.
+
+    Attributes:
+        lens: that the images were undistorted from; None without distortion.
+    """
 
     def __init__(
         self,
@@ -260,10 +282,13 @@ class _Tracking:
         frames: Iterable[Frame],
         focal: float,
         aside: tuple[float, float],
+        bend: float,
         picture: _Picture,
     ) -> None:
-        self.odometry, self.frames, self.focal, self.aside = odometry, iter(frames), focal, aside
+        self.odometry, self.frames, self.focal, self.aside, self.bend = odometry, iter(frames), focal, aside, bend
         self.inside = picture.inside
+        self.lens: Camera | None = None
+        self._undistorter: Undistorter | None = None
         self.tracked, self.last = 0, -math.inf
 
     def go_on(
@@ -281,8 +306,13 @@ class _Tracking:
             image = frame.image[self.inside]
             mask = None if frame.mask is None else frame.mask[self.inside]
             self.last, (height, width) = frame.timestamp, image.shape[:2]
-            pixels = replace(pinhole(self.focal, self.aside, width, height), readout=frame.camera.readout)
-            camera = pixels.camera(width, height)
+            found = simple_camera(self.focal, self.aside, self.bend, width, height)
+            camera = replace(found, readout=frame.camera.readout).camera(width, height)
+            if self.bend:
+                if self._undistorter is None or self._undistorter.source != camera:
+                    self._undistorter, self.lens = Undistorter(camera), camera
+                camera, image = self._undistorter.camera, self._undistorter(image)
+                mask = None if mask is None else self._undistorter.mask(mask)
             estimate = self.odometry.track(Frame(frame.index, frame.timestamp, image, camera, mask=mask))
             if on_frame is not None:
                 on_frame(frame, estimate)
@@ -303,14 +333,14 @@ def _loaded(weights: str, device: torch.device | str, seed: int) -> PatchOdometr
 
 
 @torch.inference_mode()
-def _profile(odometry: PatchOdometry) -> tuple[FocalProfile, int]:
+def _profile(odometry: PatchOdometry, lens: Camera | None) -> tuple[FocalProfile, int]:
     """Profile of the longest segment so far, and its number of frames."""
     state, config = odometry.state, odometry.config
     graph = closed_graph(odometry)
     info = adjust_segments(graph, state.adjustable, state.shutter, config.estimate_readout, config.adjustment)
     longest = max(state.adjustable or [0], key=lambda segment: len(graph.members(segment)))
     shutter = replace(state.shutter, readout=float(info["readout"]))
-    return find_focal(graph, longest, shutter, config.adjustment), len(graph.members(longest))
+    return find_focal(graph, longest, shutter, config.adjustment, lens=lens), len(graph.members(longest))
 
 
 def _principal_point(

@@ -32,6 +32,8 @@ class SelfCalibration:
         aside: way from the middle of the image to the principal point, to the right and down, pixels; 0 where it is not
             told.
         aside_deviation: standard deviations of the two, pixels; inf where it is not told.
+        bend: barrel distortion, alpha of the lens model ``eucm`` with a beta of 1; 0 where it is not told.
+        bend_deviation: its standard deviation; inf where it is not told.
     """
 
     focal: float
@@ -44,6 +46,8 @@ class SelfCalibration:
     guess: FocalGuess
     aside: tuple[float, float] = (0.0, 0.0)
     aside_deviation: tuple[float, float] = (math.inf, math.inf)
+    bend: float = 0.0
+    bend_deviation: float = math.inf
 
     @property
     def found(self) -> bool:
@@ -52,16 +56,23 @@ class SelfCalibration:
 
     @property
     def calibration(self) -> Calibration:
-        """Square pixels, the principal point at the centre or where it was found, no distortion."""
-        return pinhole(self.focal, self.aside, self.width, self.height)
+        """Square pixels, the principal point at the centre and no distortion, or what was found of them."""
+        return simple_camera(self.focal, self.aside, self.bend, self.width, self.height)
 
     def __str__(self) -> str:
         """Sentence for people."""
         value = f"{self.focal:.0f} +- {self.deviation:.0f} px"
         if self.found:
-            return f"focal length {value} (self-calibrated from {self.frames} frames){self._principal_point()}"
+            told = f"focal length {value} (self-calibrated from {self.frames} frames)"
+            return told + self._distortion() + self._principal_point()
         origin = {"prior": "the usual angle of view", "exif": "EXIF data", "video": "metadata of the video"}
         return f"focal length: cannot tell ({self.reason}): keeps {value}, from {origin.get(self.source, self.source)}"
+
+    def _distortion(self) -> str:
+        """Further line for a lens with distortion; empty for one without."""
+        if not self.bend:
+            return ""
+        return f"\nbarrel distortion: eucm, alpha {self.bend:.2f} +- {self.bend_deviation:.2f}, beta 1"
 
     def _principal_point(self) -> str:
         """Further line for a principal point of which a coordinate was found; empty for one at the centre."""
@@ -78,7 +89,7 @@ class SelfCalibration:
         """Write a calibration file for the next run, unless a file that somebody else has written is in its place.
 
         Args:
-            file: text file, ``fx fy cx cy``.
+            file: text file, ``fx fy cx cy``, or YAML for a lens with distortion.
 
         Returns:
             Whether it was written.
@@ -91,7 +102,12 @@ class SelfCalibration:
         c = self.calibration
         with replaced(Path(file)) as part:
             told = str(self).replace("\n", "\n# ")
-            part.write_text(f"{_HEADER}# {told}\n{c.fx:.3f} {c.fy:.3f} {c.cx:.1f} {c.cy:.1f}\n", encoding="utf-8")
+            line = f"{c.fx:.3f} {c.fy:.3f} {c.cx:.1f} {c.cy:.1f}\n"
+            if self.bend:
+                names = zip(("fx", "fy", "cx", "cy"), line.split(), strict=True)
+                line = "".join(f"{name}: {value}\n" for name, value in names)
+                line += f"model: {c.model}\nalpha: {self.bend:.4f}\nbeta: 1\n"
+            part.write_text(f"{_HEADER}# {told}\n{line}", encoding="utf-8")
         return True
 
 
@@ -107,13 +123,15 @@ def is_foreign(file: Path) -> bool:
         return stream.read(len(_HEADER)) != _HEADER.encode()
 
 
-def pinhole(focal: float, aside: tuple[float, float], width: int, height: int) -> Calibration:
-    """Calibration with square pixels and no distortion.
+def simple_camera(focal: float, aside: tuple[float, float], bend: float, width: int, height: int) -> Calibration:
+    """Calibration with square pixels, without distortion or with that of one number.
 
     Args:
         focal: fx and fy, pixels.
         aside: way from the middle of the image to the principal point, to the right and down, pixels.
+        bend: alpha of the model ``eucm`` with a beta of 1; 0 for none.
         width, height: of the images, pixels.
     """
     middle = centred(focal, width, height)
-    return replace(middle, cx=middle.cx + aside[0], cy=middle.cy + aside[1])
+    found = replace(middle, cx=middle.cx + aside[0], cy=middle.cy + aside[1])
+    return replace(found, model="eucm", coefficients=(bend, 1.0)) if bend else found

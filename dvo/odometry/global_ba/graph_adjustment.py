@@ -26,7 +26,6 @@ from dvo.map.correction import Moved, apply_similarities, carry
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.map import Map
 from dvo.map.recordings import increasing_times
-from dvo.map.snapshot import Snapshot
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, adjust_segment
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 
@@ -112,14 +111,14 @@ class Adjustment:
     """Global adjustment to be done.
 
     Attributes:
-        snapshot: of the graph.
+        graph: copy of the archive as it was, to be corrected at will.
         world: number of the world.
         options: kernels, iterations and size of the blocks.
         shutter: timing of the rows.
         frames, edges: bounds of the newest keyframes and measurements that are solved for; None for all.
     """
 
-    snapshot: Snapshot
+    graph: Map
     world: int
     options: AdjustmentOptions
     shutter: Shutter
@@ -127,9 +126,8 @@ class Adjustment:
     edges: int | None = None
 
     def solve(self) -> Adjusted:
-        """Solution. The graph that the snapshot was taken of is neither read nor changed."""
-        started = time.perf_counter()
-        graph = self.snapshot.map()
+        """Solution, once. The graph that the copy was taken of is neither read nor changed."""
+        started, graph = time.perf_counter(), self.graph
         members = graph.members(self.world)
         identifiers = np.array([frame.identifier for frame in members], dtype=np.int64)
         since = self._since(graph, identifiers)
@@ -144,7 +142,7 @@ class Adjustment:
         changed = [k for k, frame in before.items() if graph.archive[k] is not frame]  # the others were held
         rows = np.array(changed, dtype=np.int64)
         depths = np.array([graph.archive[int(k)].inverse_depth for k in rows], dtype=np.float32)
-        depths = depths.reshape(len(rows), self.snapshot.per_frame)
+        depths = depths.reshape(len(rows), graph.per_frame)
         scales = [float(np.median(new / before[int(k)].inverse_depth)) for k, new in zip(rows, depths, strict=True)]
         poses_cw, unit = graph.poses_cw(rows), torch.tensor(scales, dtype=torch.float64)
         similarities = sim3.from_se3(torch.cat([poses_cw[:, :3] * unit[:, None], poses_cw[:, 3:]], 1), unit)
@@ -203,16 +201,16 @@ def prepare(
     """
     options = replace(options, restart_frames=0)
     if limits is None:
-        return Adjustment(Snapshot.of(graph), world, options, shutter)
+        return Adjustment(graph.archived(), world, options, shutter)
     options = replace(options, iterations=limits.iterations)
-    return Adjustment(Snapshot.of(graph), world, options, shutter, limits.frames, limits.edges)
+    return Adjustment(graph.archived(), world, options, shutter, limits.frames, limits.edges)
 
 
 def apply(graph: KeyframeGraph, world: int, adjusted: Adjusted) -> Moved:
     """Correct the keyframes of a world by a solution, and the window if it is in this world.
 
     Args:
-        graph: corrected in place; keyframes may have been archived, and patches released, since the snapshot.
+        graph: corrected in place; keyframes may have been archived, and patches released, since the solution was begun.
         world: number of the world.
         adjusted: the solution.
 

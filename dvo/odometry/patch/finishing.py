@@ -14,7 +14,15 @@ from dvo.odometry.loops.closure import LoopCloser
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.state import TrackerState
 from dvo.odometry.protocol import Result
-from dvo.odometry.quality import CALIBRATE, CHECK_FOCAL, WRONG_FOCAL, Quality, leaves_doubt
+from dvo.odometry.quality import (
+    CALIBRATE,
+    CHECK_CAMERA,
+    MAX_SHIFT_GAIN,
+    WRONG_BEND,
+    WRONG_FOCAL,
+    Quality,
+    leaves_doubt,
+)
 from dvo.odometry.scale.metric_scale import settle_scale
 
 SURE_CONTRAST = 0.02
@@ -46,7 +54,9 @@ def finish_segments(
 def judge_result(
     graph: KeyframeGraph, result: Result, state: TrackerState, config: TrackerConfig, stride: int
 ) -> Quality:
-    """Quality of the result of a finished sequence; one that leaves doubt is asked for its focal length too.
+    """Quality of the result of a finished sequence; one that leaves doubt is asked for its camera too.
+
+    Distortion that is not in the calibration moves the corners as a crop that floats does.
 
     Args:
         graph: adjusted.
@@ -64,14 +74,18 @@ def judge_result(
     quality = measure_quality(
         graph, result, own, state.checks, stride=stride, shutter=shutter, first=state.started, fixed=state.hidden
     )
-    if not (own and leaves_doubt(quality, CHECK_FOCAL)):
+    if not (own and (leaves_doubt(quality, CHECK_CAMERA) or quality.crop > MAX_SHIFT_GAIN)):
         return quality
     longest = max(own, key=lambda segment: len(graph.members(segment)))
     profile = find_focal(graph, longest, shutter, config.adjustment, beyond=WRONG_FOCAL)
     step, sure = profile.minimum.value, profile.contrast >= SURE_CONTRAST
-    if not (sure and abs(step) > WRONG_FOCAL):
+    if profile.bend.value > WRONG_BEND:
+        lens = f"eucm, alpha {profile.bend.value:.2f}, beta 1"
+        reason = f"the measurements fit a lens with more barrel distortion ({lens})"
+    elif quality.verdict == "good" and sure and abs(step) > WRONG_FOCAL:
+        reason = f"the measurements fit a focal length {math.exp(step):.2f} times the one that is used"
+    else:
         return quality
-    reason = f"the measurements fit a focal length {math.exp(step):.2f} times the one that is used"
     return replace(quality, verdict="doubtful", reason=reason, remedy=CALIBRATE)
 
 

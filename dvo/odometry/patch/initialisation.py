@@ -159,9 +159,11 @@ def _moved(window: Window, before: Tensor, after: Tensor) -> float:
 
 def _solve_again(patch_window: PatchWindow, beside: Beside | None) -> bool:
     """Replace poses and depths by a solution from one pose for all frames if it suits the flow better; if they were."""
-    window = patch_window.window
+    # The flow that the window was solved for suits its solution: what the network says of it now tells others apart.
+    window, revision = patch_window.window, patch_window.revise()
+    problem = window.problem().with_values(targets=revision.targets[0], weights=revision.weights[0])
     # Not solved further: a narrow kernel would fit the first, coarse flow.
-    best = preferred(multistart(window.problem(), {PRESENT: present, **COLD_STARTS}, AS_THEY_ARE, beside=beside))
+    best = preferred(multistart(problem, {PRESENT: present, **COLD_STARTS}, AS_THEY_ARE, beside=beside))
     if best.start != PRESENT:
         _take(window, best)
     return best.start != PRESENT

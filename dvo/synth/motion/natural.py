@@ -22,8 +22,7 @@ from dvo.core.errors import DvoError
 from dvo.synth import salts
 from dvo.synth.motion.motion import SplinePath
 from dvo.synth.motion.paths import find_start
-from dvo.synth.motion.walks import longest_way, nearest_turn, yaw_towards
-from dvo.synth.render.renderer import render_depth
+from dvo.synth.motion.walks import longest_way, nearest_turn, openness, yaw_towards
 from dvo.synth.scenes.scene import Scene
 
 Array = np.ndarray
@@ -157,14 +156,11 @@ def natural_path(
     rng = np.random.default_rng([seed, salts.NATURAL_PATH])
     best: tuple[float, SplinePath] | None = None
     checked = np.linspace(0, duration, max(20, int(duration * 10)))
-    k = np.array([16.0, 16.0, 11.5, 8.5])
     for attempt in range(40):
         path = _draw(scene, rng, kind, duration, speed * 0.85 ** (attempt // 6), shake)
         if path is None or scene.clearance(path.poses_wc(checked)[:, :3]).min() < 0.15:
             continue
-        depth = render_depth(scene, path.poses_wc(checked[:: max(1, len(checked) // 16)]), k, 18, 24)[0].numpy()
-        near = np.quantile(depth, 0.03, axis=(1, 2)) / np.median(depth)
-        score = float(np.minimum(near, 0.3).min() + np.minimum(near, 0.3).mean())
+        score = openness(scene, path.poses_wc(checked[:: max(1, len(checked) // 16)]))
         if best is None or score > best[0]:
             best = (score, path)
         if score > 0.25:

@@ -63,10 +63,7 @@ def long_path(
         room_left = scene.clearance(path.poses_wc(times)[:, :3]).min() / scene.scale
         if room_left < 0.03:
             continue
-        k = np.array([16.0, 16.0, 11.5, 8.5])
-        depth = render_depth(scene, path.poses_wc(times[:: max(1, len(times) // 12)]), k, 18, 24)[0].numpy()
-        near = np.quantile(depth, 0.03, axis=(1, 2)) / np.median(depth)
-        score = float(np.minimum(near, 0.3).min() + np.minimum(near, 0.3).mean())
+        score = openness(scene, path.poses_wc(times[:: max(1, len(times) // 12)]))
         if best is None or score > best[0]:
             best = (score, path)
         if score > 0.35:
@@ -74,6 +71,21 @@ def long_path(
     if best is None:
         raise DvoError("found no free path through the scene", field="seed", remedy="try another seed or less speed")
     return best[1]
+
+
+def openness(scene: Scene, poses_wc: Array) -> float:
+    """How far away the nearest surfaces in the views of a path are, against the median depth of all.
+
+    Args:
+        scene: to look at.
+        poses_wc: ``(N, 7)`` of the cameras.
+
+    Returns:
+        0 to 0.6.
+    """
+    depth = render_depth(scene, poses_wc, np.array([16.0, 16.0, 11.5, 8.5]), 18, 24)[0].numpy()
+    near = np.minimum(np.quantile(depth, 0.03, axis=(1, 2)) / np.median(depth), 0.3)
+    return float(near.min() + near.mean())
 
 
 def _draw(scene: Scene, rng: np.random.Generator, kind: str, duration: float, pace: float, shake: float) -> SplinePath:

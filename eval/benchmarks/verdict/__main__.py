@@ -1,8 +1,9 @@
 """Verdicts on runs that are right and on runs that were made to fail: `python -m eval.benchmarks.verdict`.
 
 Rendered clips are tracked as they are, under the conditions of the rendered suites, and after a change that makes the
-odometry fail: something fixed to the camera, a crowd, waves, a floating crop, a wrong focal length, frames left out, a
-spoiled network, something that moves before a camera that stands still. A run is wrong if its ATE is above 2 % of the
+odometry fail: something fixed to the camera, a crowd, waves, a floating crop, a wrong focal length, a lens whose
+distortion is not in the calibration, frames left out, a spoiled network, something that moves before a camera that
+stands still. A run is wrong if its ATE is above 2 % of the
 path and above five times that of the best of dvo, `keyframe` and `klt-pnp` on the same clip as it was rendered, or if
 it has poses before a camera that stands still. Scenes with an even number were there to choose the thresholds of
 `dvo.odometry.quality` by; those of the odd ones are printed apart. Intervals are Wilson's of 95 %.

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from dvo.data.frame import Frame
+from dvo.geometry.undistort import undistort
 
 Change = Callable[[np.random.Generator, Sequence[Frame], int], Iterator[Frame]]
 """Frames changed; the number of the trial chooses among the members of a kind."""
@@ -108,6 +109,23 @@ def with_wrong_focal(_: np.random.Generator, frames: Sequence[Frame], number: in
     for frame in frames:
         camera = frame.camera
         yield replace(frame, camera=replace(camera, fx=camera.fx * factor, fy=camera.fy * factor))
+
+
+def through_bent_lens(_: np.random.Generator, frames: Sequence[Frame], number: int) -> Iterator[Frame]:
+    """Images of a lens with barrel distortion, whose calibration has the right focal length and no distortion."""
+    bend, first = (0.2, 0.35, 0.5)[number % 3], frames[0].camera
+    columns, rows = np.meshgrid(np.arange(float(first.width)), np.arange(float(first.height)))
+    pixels = np.stack([columns, rows], -1)
+    focal, centre = np.array([first.fx, first.fy]), np.array([first.cx, first.cy])
+    for zoom in np.arange(1.0, 3.0, 0.02):  # the shortest focal length with which no pixel looks past the picture
+        lens = replace(first, fx=first.fx * zoom, fy=first.fy * zoom, model="eucm", coefficients=(bend, 1.0))
+        seen = undistort((pixels - centre) / (focal * zoom), lens) * focal + centre
+        if np.isfinite(seen).all() and (seen >= 0).all() and (seen <= [first.width - 1, first.height - 1]).all():
+            break
+    x, y = np.moveaxis(seen.astype(np.float32), -1, 0)
+    pinhole = replace(lens, model="none", coefficients=())
+    for frame in frames:
+        yield replace(frame, image=cv2.remap(frame.image, x, y, cv2.INTER_LINEAR), camera=pinhole)
 
 
 def before_still_camera(rng: np.random.Generator, frames: Sequence[Frame], number: int) -> Iterator[Frame]:

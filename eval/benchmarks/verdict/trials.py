@@ -27,6 +27,7 @@ CHANGES: dict[str, failures.Change] = {
     "waves": failures.with_waves,
     "crop": failures.with_floating_crop,
     "focal": failures.with_wrong_focal,
+    "lens": failures.through_bent_lens,
     "still": failures.before_still_camera,
 }
 KINDS = ("right", *CHANGES, "dropped", "weights")
@@ -65,7 +66,7 @@ class Trial:
             found |= CONDITIONS[n // 2 % len(CONDITIONS)]
         if self.kind == "dropped":
             found |= {"kind": ("fast", "handheld")[n % 2], "fps": (1.5, 2.0, 3.0)[n % 3], "speed": 2.0}
-        if self.kind == "focal":
+        if self.kind in ("focal", "lens"):
             found |= {"kind": ("orbit", "handheld", "fast")[n % 3]}
         return found
 

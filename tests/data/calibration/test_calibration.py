@@ -1,10 +1,13 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from dvo.core.errors import DvoError
 from dvo.data import Calibration, read_calibration
+from dvo.data.calibration import values
+from dvo.geometry.lenses import LENSES, Lens
 
 
 @pytest.mark.parametrize(
@@ -233,3 +236,14 @@ def test_focal_lengths_of_zero_are_one_error():
 def test_a_folder_is_no_calibration(tmp_path):
     with pytest.raises(DvoError, match="calibration: a folder, no file"):
         read_calibration(tmp_path)
+
+
+@pytest.mark.parametrize("entry", ["distortion_coefficients: [0.2, 0.1]", "a1: 0.2\na2: 0.1"])
+def test_a_lens_model_needs_a_row_and_a_name_to_be_read(entry, tmp_path, monkeypatch):
+    """No branch of its own: what a file says of a model is never taken for another one."""
+    monkeypatch.setitem(LENSES, "quadratic", Lens(("a1", "a2"), (2,), lambda t, k: (t, np.ones_like(t))))
+    monkeypatch.setattr(values, "model_of", lambda name: "quadratic")
+    file = tmp_path / "camera.yaml"
+    file.write_text(f"fx: 500\nfy: 500\ncx: 320\ncy: 240\ndistortion_model: quadratic\n{entry}\n")
+    found = read_calibration(file)
+    assert found.model == "quadratic" and found.coefficients == (0.2, 0.1)

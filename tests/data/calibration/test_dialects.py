@@ -681,6 +681,27 @@ READ = [
     ("anipose_wide.toml", TOML.format("[0.1, -0.2, 0.003, 0.004]", "fisheye = true"), NUMBERS, "fisheye", KC,
      (640, 480)),
     ("a.pincam", "640 480 500 510 320 240\n", NUMBERS, "none", (), (640, 480)),
+    ("okvis2.yaml", OKVIS.replace("T_SC:", "camera_type: gray, T_SC:"), NUMBERS, "radtan", KC, (640, 480)),
+    ("camodocal.yaml", VINS_PINHOLE.replace("PINHOLE", "PINHOLE_FULL").replace(
+     "   p1", "   k3: 0.05\n   k4: 0.06\n   k5: 0.07\n   k6: 0.08\n   p1"), NUMBERS, "radtan", EIGHT, (640, 480)),
+    ("slam_tlr.yaml", SLAM + "Tlr: !!opencv-matrix\n  rows: 3\n  cols: 4\n  dt: f\n  data: [1, 0, 0, 0.1, 0, 1, 0, 0, "
+     "0, 0, 1, 0]\nvelo_to_cam: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0]\n", NUMBERS, "radtan", FIVE, (640, 480)),
+    ("cv5.yml", f"%YAML 1.2\n---\nK: {ROWS}\nD: !!opencv-nd-matrix\n   sizes: [ 5 ]\n   dt: d\n   data: {list(FIVE)}\n",
+     NUMBERS, "radtan", FIVE, (None, None)),
+    ("cv_comment.json", f'{{\n  "K": {ROWS}\n  // flags: +zero_tangent_dist\n  ,\n  "D": {list(FIVE)}\n}}', NUMBERS,
+     "radtan", FIVE, (None, None)),
+    ("tuple.yaml", f"K: {ROWS}\ndist: !!python/tuple {list(FIVE)}\nimage_size: !!python/tuple\n- 640\n- 480\n", NUMBERS,
+     "radtan", FIVE, (640, 480)),
+    ("led.yml", f"left_camera_matrix: {ROWS}\nleft_dist_coeffs: {list(FIVE)}\nright_camera_matrix: {MATRIX}\n"
+     f"right_dist_coeffs: {list(KC)}\n", NUMBERS, "radtan", FIVE, (None, None)),
+    ("led.json", json.dumps({"cam0_K": json.loads(ROWS), "cam0_D": FIVE, "cam1_K": np.eye(3).tolist(), "cam1_D": KC}),
+     NUMBERS, "radtan", FIVE, (None, None)),
+    ("azure.yaml", f"depth_camera: {{K: {MATRIX.replace('500', '400')}}}\ncolor_camera: {{K: {MATRIX}}}\n", NUMBERS,
+     "none", (), (None, None)),
+    ("camera.ini", "; made by someone\n[camera]\nfx = 500\nfy = 510 ; pixels\ncx = 320\ncy = 240\nk1 = 0.1\nk2 = -0.2\n"
+     "p1 = 0.003\np2 = 0.004\n[other]\nname\n", NUMBERS, "radtan", KC, (None, None)),
+    ("camera.cfg", f"[intrinsics]\ncamera_matrix = {ROWS}\n[distortion]\ncoefficients = 0.1 -0.2 0.003 0.004 0.05\n"
+     "[image]\nwidth = 640\nheight = 480\n", NUMBERS, "radtan", FIVE, (640, 480)),
     ("calib_cam_to_cam.txt", KITTI_RAW, (721.5377, 721.5377, 609.5593, 172.854), "none", (), (1242, 375)),
     ("kitti_recorded.txt", KITTI_RAW.replace("_rect", "_left"), (984.2439, 980.8141, 690, 233.1966), "radtan",
      (-0.3728755, 0.2037299, 0.002219027, 0.001383707, -0.07233722), (1392, 512)),
@@ -740,7 +761,8 @@ LENS_KEYS = [
     "undocumented: {fisheye: true, k1: 0.2}", "curvature: -0.1",
     "mapping: equisolid", "optics_kind: stereographic", "wide_angle: true", "distortion_coefficients: some",
     "resolution: {width: 640, height: 480, distort: {type: DISTORT_FTHETA, coeffs: [0.1, -0.2, 0.02, 0.001]}}",
-    "cam_d0: [0.1]\nmodel: none", "camera_k7: 0.1", "disto_k3: [-0.2, 0.05, 0.01]",
+    "cam_d0: [0.1]\nmodel: none", "camera_k7: 0.1", "disto_k3: [-0.2, 0.05, 0.01]", "k: [0.1, -0.2]",
+    "p: [0.003, 0.004]",
 ]  # fmt: skip
 
 
@@ -892,6 +914,13 @@ REFUSED = [
     ("profile.json", json.dumps(GYROFLOW | {"distortion_model": "poly5"}), "distortion_model: 'poly5'"),
     ("profile.json", json.dumps(GYROFLOW | {"fisheye_params": 3}), "not a mapping"),
     ("aspect.yaml", "focal_length: 500\naspect_ratio: 1.02\ncx: 320\ncy: 240\n", "aspect_ratio: 1.02 beside one"),
+    ("xi.yaml", VINS_PINHOLE + "xi: 1.9\n", "xi may be lens distortion"),
+    ("four.yaml", PINHOLE + "k1: 0.1\nk2: -0.2\nk3: 0.003\nk4: 0.004\n", "k4: k1 to k4 without p1 and p2"),
+    ("undistorted.yaml", PINHOLE + f"D: {list(FIVE)}\nundistorted: true\n", "undistorted: true, but there are coeffic"),
+    ("rectified.yaml", PINHOLE + f"D: {list(FIVE)}\nrectified: 1\n", "rectified: 1, but there are coefficients"),
+    ("zeros.yaml", f"K: {[0.0] * 9}\nD: []\n", "the camera is not calibrated"),
+    ("camera.ini", "[camera]\nfx = 500\nfx = 510\n", "not understood .*fx"),
+    ("warp.ini", "[camera]\nfx = 500\nfy = 510\ncx = 320\ncy = 240\nlens_warp = 0.1 0.2\n", "camera.lens_warp"),
     ("cut.toml", "[cam_0]\nmatrix = [ [ 500.0,", "not valid TOML"),
     ("own.toml", TOML.format("[0.1, -0.2]", "warp = [0.1, 0.2, 0.3, 0.4, 0.5]"), "2 coefficients"),
 ]  # fmt: skip
@@ -903,6 +932,17 @@ def test_what_is_refused(make, name, text, match):
     with pytest.raises(DvoError, match=match) as caught:
         read_calibration(file)
     assert caught.value.file == file and caught.value.remedy
+
+
+@pytest.mark.parametrize(("values", "remedy"), [
+    ({"CameraDefaults": {"CaptureSettings": [{"Width": 640, "Height": 480, "FOV_Degrees": 90}]}}, "tan("),
+    ({"fieldOfView": 60.0, "pixelWidth": 640}, "vertical angle"), ({"fov": 90}, "horizontal angle"),
+    ({"lens": 50.0, "sensor_width": 36.0, "resolution_x": 640}, "width of the sensor"), ({"a": 1}, "write 'fx fy cx"),
+])  # fmt: skip
+def test_files_of_simulators_and_renderers_are_refused_with_the_formula(make, values, remedy):
+    with pytest.raises(DvoError, match="no fx, fy, cx, cy in it") as caught:
+        read_calibration(make.text("settings.json", json.dumps(values)))
+    assert remedy in str(caught.value.remedy)
 
 
 @pytest.mark.parametrize("text", [
@@ -1055,8 +1095,25 @@ def test_values_in_another_unit_and_coefficients_without_a_model_are_told(make, 
     assert note in found.notes[0] and found.depth_scale is None and found.doubts(640, 480) == list(found.notes)
 
 
+@pytest.mark.parametrize(("name", "text", "told"), [
+    ("c.txt", "500 510 320 240 -0.3 0.1 0.08 -0.01", True), ("c.txt", "500 510 320 240 -0.3 0.1 0.02 -0.01", False),
+    ("c.yaml", PINHOLE + "model: radtan\nD: [-0.3, 0.1, -0.06, 0.001, 0.002]\n", True),
+    ("c.yaml", PINHOLE + "model: fisheye\nD: [-0.3, 0.1, -0.06, 0.01]\n", False),
+])  # fmt: skip
+def test_tangential_coefficients_of_no_lens_are_told(make, name, text, told):
+    """As of a fisheye, or in the order k1 k2 k3 p1 p2."""
+    notes = read_calibration(make.text(name, text)).notes
+    assert any("no usual lens" in note for note in notes) == told
+
+
+def test_a_file_of_a_depth_camera_alone_is_told(make):
+    file = make.text("c.json", json.dumps({"depth_intrinsics": {"fx": 500, "fy": 510, "cx": 320, "cy": 240}}))
+    assert "is that the camera of the images, or of depth?" in read_calibration(file).notes[0]
+
+
 @pytest.mark.parametrize("line", [f"D: {list(FIVE)}", f"model: radtan\nD: {list(KC)}", "k1: 0.1\nk2: 0.1\np1: 0\np2: 0",
-                                  f"fisheye: 1\nD: {list(KC)}", "depth_scale: 5000\nbaseline: 0.12"])  # fmt: skip
+                                  f"fisheye: 1\nD: {list(KC)}", "depth_scale: 5000\nbaseline: 0.12", "k: [0, 0]",
+                                  "undistorted: true", "rectified: true"])  # fmt: skip
 def test_what_is_plain_needs_no_note(make, line):
     assert not read_calibration(make.text("c.yaml", f"{PINHOLE}{line}\n")).notes
 
@@ -1079,6 +1136,20 @@ def test_the_region_that_a_ros_camera_reads_out(make, region, principal, size):
     found = read_calibration(make.text("camera_info.yaml", INFO.format(*region)))
     assert (found.fx, found.fy, found.cx, found.cy) == (500, 510, *principal)
     assert (found.width, found.height) == size
+
+
+@pytest.mark.parametrize(
+    ("bins", "numbers", "size"),
+    [((0, 0), (500, 510, 221, 191), (320, 240)), ((2, 2), (250, 255, 110.5, 95.5), (160, 120)),
+     ((1, 4), (500, 127.5, 221, 47.75), (320, 60))],
+)  # fmt: skip
+def test_pixels_that_a_ros_camera_adds_up(make, bins, numbers, size):
+    """As image_geometry of ROS: K is that of the whole sensor, divided behind the region."""
+    binning = f"binning_x: {bins[0]}\nbinning_y: {bins[1]}\n"
+    found = read_calibration(make.text("camera_info.yaml", INFO.format(100, 50, 240, 320) + binning))
+    assert (found.fx, found.fy, found.cx, found.cy) == numbers and (found.width, found.height) == size
+    with pytest.raises(DvoError, match="binning_x: no number of pixels"):
+        read_calibration(make.text("camera_info.yaml", INFO.format(0, 0, 0, 0) + "binning_x: 1.5\n"))
 
 
 def test_a_region_beyond_the_sensor(make):

@@ -1,13 +1,16 @@
 """Depth images for any source: by time, by name, in order; registered, resized, or of another camera."""
 
+import io
+
 import cv2
 import numpy as np
 import pytest
 
 from dvo.core.errors import DvoError
 from dvo.data import Calibration, open_source
-from dvo.data.companions.depth_source import with_depth
+from dvo.data.companions.depth_source import depth_range, with_depth
 from dvo.data.sensors.depth import registered_depth, resized_depth
+from dvo.data.streams.live_source import open_stream
 from dvo.geometry.camera import Camera
 from tests.support.tum_folder import depth_image, tum
 
@@ -31,6 +34,32 @@ def test_by_the_numbers_in_the_names_in_any_unit(make):
     assert depths(with_depth(source, folder)) == [1, None, 3]
     assert depths(with_depth(source, folder, scale=500)) == [2, None, 6]
     assert depths(source) == [None] * 3  # as it was
+
+
+@pytest.mark.parametrize(("unit", "told"), [(1, None), (1000, "1500 to 2500 m"), (0.01, "0.015 to 0.025 m")])
+def test_depth_in_another_unit_is_told(make, unit, told):
+    """Floats are metres, whatever ``scale``; nothing else says that they are millimetres."""
+    source = images(make)
+    (make.root / "d").mkdir()
+    depth = np.full((48, 64), unit * 1.5, np.float32)
+    depth[:, ::2], depth[0] = unit * 2.5, np.nan
+    for number in (2, 3):
+        np.save(make.root / "d" / f"{number}.npy", depth)
+    found = with_depth(source, make.root / "d")
+    assert depth_range(found) == pytest.approx((1.5 * unit, 2.5 * unit))
+    said = [f"most of the depth is {told}: is it in another unit" in line for line in found.warnings]
+    assert said == [True] * bool(told)
+    assert depth_range(source) is None
+
+
+def test_a_stream_is_not_read_for_its_range_of_depth(make):
+    """It can be read once."""
+    code = b"".join(cv2.imencode(".png", make.image(k))[1].tobytes() for k in range(3))
+    for number in range(3):
+        depth_image(make, f"d/{number}.png", number + 1, 1000)
+    stream = open_stream(io.BytesIO(code), calib=make.calib(), fps=10)
+    source = with_depth(stream, make.root / "d")
+    assert depth_range(source) is None and depths(source) == [1, 2, 3]
 
 
 def test_paths_beside_the_source(make):

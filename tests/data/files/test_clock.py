@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from dvo.core.errors import DvoError
 from dvo.data import read_tum
 from dvo.data.files.clock import PARTS, clock_of_names, clock_of_rows
+from dvo.data.files.listing import listed_files
 from dvo.data.files.stamps import read_times
 from dvo.data.readers.groundtruth import read_groundtruth
 
@@ -43,6 +44,9 @@ def test_decimal_seconds_stay_seconds(rate, start, count):
         ("2011-09-26 13:02:25.594360375\n2011-09-26 13:02:25.697\n", [0, 0.10264]),  # KITTI raw
         ("secs,nsecs\n5,900000000\n6,5\n", [0, 0.1]),
         ("1305031102 90000000\n1305031102 190000000\n", [0, 0.1]),
+        ("1305031102 90000\n1305031102 190000\n1305031103 5000\n", [0, 0.1, 0.915]),
+        ("1305031102 90\n1305031102 190\n1305031103 5\n", [0, 0.1, 0.915]),
+        ("tv_sec,tv_usec\n5,900000\n6,5\n", [0, 0.100005]),
         ("0.000\n16.683\n33.367\n", [0, 0.01668, 0.03337]),
         ("33333333\n66666667\n", [0, 0.03333]),
         ("0\n1\n2\n", [0, 1, 2]),
@@ -240,3 +244,52 @@ def test_rows_of_vins_without_a_header_are_refused(make):
     assert "timestamp,tx,ty,tz,qw,qx,qy,qz" in str(caught.value.remedy)
     found = read_tum(make.text("vio.csv", "timestamp,tx,ty,tz,qw,qx,qy,qz\n" + row.format(0)))
     assert found.poses_wc[0, 6] == pytest.approx(0.9 / np.sqrt(0.95))
+
+
+T0 = 1_700_000_000.25 + np.arange(60) / 30
+
+
+@pytest.mark.parametrize("form", ["{0}_{1:09d}", "{0}_{1}", "{0}-{2:06d}", "{0}_{2}", "left_{0}_{3:03d}", "{0}.{1}"])
+def test_seconds_and_their_parts_in_names(form):
+    """Also with a point between two numbers, where nanoseconds have lost the zeros that they begin with."""
+    wholes = np.floor(T0).astype(int)
+    rests = [np.floor((T0 - wholes) * parts + 1e-6).astype(int) for parts in (10**9, 10**6, 10**3)]
+    stems = [form.format(*row) for row in zip(wholes.tolist(), *(rest.tolist() for rest in rests), strict=True)]
+    found = clock_of_names(stems)
+    np.testing.assert_allclose(found.seconds, T0, rtol=0, atol=1.1e-3)
+    assert (found.note("them") is not None) == (form == "{0}.{1}")
+
+
+@pytest.mark.parametrize("form", ["{0}_{1}", "{0}_{1:03d}", "{0}_{2:06d}", "{0}_{3}"])
+def test_numbers_of_images_behind_a_second_are_no_parts_of_it(form):
+    """Counted in the second or from the first image on, all of them or every fifth."""
+    rows = [(1_700_000_000 + k // 30, k % 30, k, 5 * k) for k in range(90)]
+    found = clock_of_names([form.format(*row) for row in rows])
+    assert found is None or (found.seconds == [row[0] for row in rows]).all()
+
+
+def test_decimals_without_their_last_zeros_are_plain():
+    assert clock_of_names([f"{t:.6f}".rstrip("0") for t in T0]).note("them") is None
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("[m]", 1), ("[mm]", 1e-3), ("(ft)", 0.3048), ("(world)", 1)])
+def test_the_unit_of_positions(make, unit, metres):
+    header = f"time,x {unit},y {unit},z {unit},qx,qy,qz,qw\n"
+    found = read_tum(make.text("t.csv", header + "0.5,1,2,3,0,0,0,1\n"))
+    np.testing.assert_allclose(found.positions, [[metres, 2 * metres, 3 * metres]])
+    with pytest.raises(DvoError, match="positions in several units: x"):
+        read_tum(make.text("t.csv", f"time,x [mm],y [m],z {unit},qx,qy,qz,qw\n0.5,1,2,3,0,0,0,1\n"))
+
+
+def test_lists_whose_fractions_have_lost_zeros_are_refused(make):
+    rows = "".join(f"{int(t)}.{round(t % 1 * 1e9)} rgb/{k}.png\n" for k, t in enumerate(T0))
+    poses = rows.replace("rgb/", "0 0 0 0 0 0 1 # ")
+    for read, text in ((listed_files, rows), (read_tum, poses), (lambda file: read_times(file, None), poses)):
+        with pytest.raises(DvoError, match="fractions of seconds that have lost their leading zeros"):
+            read(make.text("rgb.txt", text))
+
+
+def test_poses_with_seconds_and_microseconds(make):
+    rows = "".join(f"{int(t)},{round(t % 1 * 1e6)},0,0,0,0,0,0,1\n" for t in T0)
+    found = read_tum(make.text("t.csv", "sec,usec,x,y,z,qx,qy,qz,qw\n" + rows))
+    np.testing.assert_allclose(found.timestamps, T0, rtol=0, atol=2e-6)

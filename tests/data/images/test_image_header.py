@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
+from dvo.core.errors import DvoError
+from dvo.data import open_source
 from dvo.data.images.image_header import holds_several, image_size
 from dvo.data.images.images import is_complete, read_image
 
@@ -94,7 +96,10 @@ def test_files_of_several_images(tmp_path: Path) -> None:
         animation = cv2.Animation()
         animation.frames, animation.durations = images, [100] * 3
         assert cv2.imwriteanimation(str(tmp_path / name), animation)
-    assert all(holds_several(tmp_path / name) for name in ("pages.tif", "animated.png", "animated.webp"))
+    for name in ("pages.tif", "animated.png", "animated.webp"):
+        assert holds_several(tmp_path / name)
+        with pytest.raises(DvoError, match="an animated image, or one of several pages, is no video"):
+            open_source(tmp_path / name)
 
 
 @pytest.mark.parametrize(("kind", "several"), [(0, True), (1, False), (4, False)])

@@ -34,6 +34,10 @@ MANY = {
     "betaflight": ("loopIteration,time (us),gyroADC[0] (deg/s),gyroADC[1] (deg/s),gyroADC[2] (deg/s),accSmooth[0] (g),"
                    "accSmooth[1] (g),accSmooth[2] (g)",
                    [TIMES, TIMES * 1e6, np.degrees(GYRO), ACCEL / STANDARD_GRAVITY]),
+    "plotjuggler": ("__time," + ",".join(f"/imu/{name}/{axis}" for name in ("angular_velocity", "linear_acceleration")
+                                         for axis in "xyz"), [TIMES, GYRO, ACCEL]),
+    "uzh-fpv": ("# id timestamp ang_vel_x ang_vel_y ang_vel_z lin_acc_x lin_acc_y lin_acc_z",
+                [np.arange(COUNT), TIMES, GYRO, ACCEL]),
     "xsens": ("PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z", [TIMES, TIMES * 1e4, ACCEL, GYRO]),
 }  # fmt: skip
 

@@ -106,6 +106,51 @@ def test_times_option(make, text):
     assert times[0] in (0.5, 5e8) and times[1] - times[0] == pytest.approx(0.2)
 
 
+NAMED = [
+    (["7f.png", "03.png", "b1.png"], "7f.png 0.5\n03.png 0.7\nb1.png 0.9\n", [0, 1, 2]),  # order of the list alone
+    (["a0.png", "a1.png", "a2.png"], "time [ms],file\n900,clip\\a0.png\n700,clip\\a1.png\n500,clip\\a2.png\n",
+     [2, 1, 0]),
+    (["a3.png", "a4.png", "a5.png"], "".join(f"a{k} 2024-01-02 10:11:{k / 5:06.3f}\n" for k in range(9)), [0, 1, 2]),
+    (["00003.png", "00004.png", "00005.png"], "".join(f"{k:05} {k / 5 - 0.1:.3f} 4.1\n" for k in range(9)), [0, 1, 2]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("names", "text", "order"), NAMED, ids=["hashes", "backwards", "dates", "numbers"])
+def test_times_of_rows_that_name_their_images(make, names, text, order):
+    folder = make.images("clip", names)
+    make.text("times.txt", text)
+    for path in (folder, make.root):
+        source = open_source(path, calib=make.calib())
+        assert [file.name for file in source.recording.images] == [names[k] for k in order]
+        times = [frame.timestamp for frame in source]
+        assert np.diff(times) == pytest.approx([0.2, 0.2], abs=1e-6)
+        assert any("name images that are not there" in said for said in source.warnings) == (text.count("\n") == 9)
+
+
+def test_images_that_no_row_names(make):
+    folder = make.images("clip", ["a.png", "b.png", "c.png"])
+    file = make.text("times.txt", "a.png 1\nc.png 2\n")
+    with pytest.raises(DvoError, match="no row for b.png") as caught:
+        open_source(folder, calib=make.calib())
+    assert caught.value.file == file
+    make.text("times.txt", "a.png 1\nb.png x\nc.png 2\n")
+    with pytest.raises(DvoError, match="line 2: no time beside the name"):
+        open_source(folder, calib=make.calib())
+
+
+def test_numbers_that_are_no_names(make):
+    """Seconds from 0 for images that are counted from 1."""
+    folder = make.images("clip", ["1.png", "2.png", "3.png"])
+    make.text("times.txt", "0\n1\n2\n")
+    assert [frame.timestamp for frame in open_source(folder, calib=make.calib())] == [0, 1, 2]
+
+
+def test_times_in_names_are_no_parts_of_several_recordings(make):
+    names = [f"{9 + k / 4:.2f}".rstrip("0") + ".png" for k in range(12)]
+    source = open_source(make.images("clip", [name.replace("..", ".0.") for name in names]), calib=make.calib())
+    assert not source.warnings and len(list(source)) == 12
+
+
 @pytest.mark.parametrize(
     ("text", "match"),
     [("0\n1\n", "2 rows for 3 images"), ("0\n1\n1\n", "increase"), ("0\nx\n2\n", "'x' is no time"), ("", "0 rows")],

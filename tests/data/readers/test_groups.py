@@ -1,11 +1,14 @@
 """Several streams in one folder."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
 
 import dvo
 from dvo.core.errors import DvoError
+from dvo.data import open_source
 from dvo.data.companions.depth_source import with_depth
 from dvo.data.companions.right_source import with_right
 from dvo.data.images.images import is_complete, list_images
@@ -124,6 +127,18 @@ def test_few_bits_of_16(make, bits):
     grey[0, 0] = 255
     assert np.array_equal(frame.image[..., 0], grey)
     assert len(source.warnings) == 1 and f"hold {bits} bits" in source.warnings[0]
+
+
+@pytest.mark.parametrize(("low", "factor", "told"), [
+    (29_000, 6, "29[0-9]{3} to [23][0-9]{4} of 65535"), (7_000, 2, "7[0-9]{3} to 7[0-9]{3} of 16383"), (2_000, 200, ""),
+])  # fmt: skip
+def test_levels_of_temperatures_are_told(make, low, factor, told):
+    folder = make.root / "deep"
+    folder.mkdir()
+    for i in range(3):
+        cv2.imwrite(str(folder / f"{i}.png"), low + factor * make.image(i)[..., 1].astype(np.uint16))
+    said = " ".join(dvo.open(folder, calib=make.calib(), fps=10).warnings)
+    assert re.search(f"have levels from {told}", said) if told else "levels" not in said
 
 
 def test_what_follows_the_end_of_an_image():
@@ -265,3 +280,24 @@ def test_jpeg_files_of_other_endings(make):
     for i, ending in enumerate(("jfif", "jpe", "JPG")):
         (folder / f"{i}.{ending}").write_bytes(cv2.imencode(".jpg", make.image(i))[1].tobytes())
     assert len(list(dvo.open(folder, calib=make.calib(), fps=10))) == 3
+
+
+def test_streams_of_airsim(make):
+    """The number before a stamp that both share is that of the kind of image."""
+    names = [f"img_Drone1__{kind}_{1700000000000000000 + k * 33333333}.png" for kind in (0, 5) for k in range(4)]
+    source = open_source(make.images("clip", names), calib=make.calib())
+    assert [file.name for file in source.recording.images] == names[:4]
+    assert "img_Drone*__5_*.png (4), which are not used" in source.warnings[0]
+
+
+@pytest.mark.parametrize(("stems", "told"), [
+    (["one", "two", "three", "four", "five"], True), (["7f03a1", "03b2ff", "b19c00", "e24d01", "55aa12"], True),
+    (["0af438d2-9752", "3b5f3d86-268e", "03e0a813-bdc2", "11aa813b-cdc2", "e1aa813b-c0c2"], True),
+    ([f"{k * 3:02x}" for k in range(12)], False), (["a1", "a2", "a3", "b1"], False), (["one", "two", "three"], False),
+])  # fmt: skip
+def test_names_that_are_in_no_order_are_told(make, stems, told):
+    folder = make.images("clip", [f"{stem}.png" for stem in stems])
+    said = open_source(folder, calib=make.calib(), fps=10).warnings
+    assert any("do not tell in which order" in line for line in said) == told
+    make.text("times.txt", "".join(f"{stem}.png {k / 10}\n" for k, stem in enumerate(stems)))
+    assert not any("in which order" in line for line in open_source(folder, calib=make.calib()).warnings)

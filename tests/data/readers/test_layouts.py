@@ -40,6 +40,29 @@ def test_euroc_is_entered_anywhere(make, place):
     assert source.calibration.file.name == "sensor.yaml"
 
 
+@pytest.mark.parametrize(("parts", "unit"), [(1_000, "microseconds"), (1_000_000, "milliseconds")])
+def test_euroc_s_layout_with_dates_in_another_unit(make, parts, unit):
+    """As recorders of their own write it; images, truth and inertial samples keep one clock."""
+    root = euroc(make)
+    imu = "".join(f"{STAMPS[0] + 5_000_000 * k},0,0,0.1,0,0,9.81\n" for k in range(31))
+    make.text("s/mav0/imu0/data.csv", imu)
+    for file in root.rglob("data.csv"):
+        rows = [line.split(",", 1) for line in file.read_text().splitlines()]
+        file.write_text("".join(f"{int(stamp) // parts},{rest}\n" for stamp, rest in rows))
+    source = dvo.open(root)
+    assert source.timestamps == pytest.approx([stamp / 1e9 for stamp in STAMPS], abs=1e-3)
+    assert source.groundtruth.positions[:, 0] == pytest.approx([0, 1, 2, 3])
+    assert np.diff(source.inertial.timestamps) == pytest.approx(0.005, abs=1e-3)
+    assert f"taken for {unit}" in source.warnings[0] and len(list(source)[2].inertial) > 8
+
+
+def test_a_header_states_the_unit_of_relative_stamps(make):
+    root = euroc(make)
+    rows = "".join(f"{50_000 * i},{stamp}.png\n" for i, stamp in enumerate(STAMPS))
+    make.text("s/mav0/cam0/data.csv", "#timestamp [us],filename\n" + rows)
+    assert dvo.open(root).timestamps == pytest.approx([0, 0.05, 0.1, 0.15])
+
+
 @pytest.mark.parametrize("place", ["mav0/cam1", "mav0/cam1/data"])
 def test_the_right_camera_alone(make, place):
     source = dvo.open(euroc(make) / place)

@@ -309,6 +309,9 @@ def test_images_of_a_region_of_the_sensor(tmp_path, region, principal, size):
     )
     found = calibration_of_info(info, "image_raw", tmp_path / "a.bag")
     assert (found.cx, found.cy, found.width, found.height) == (*principal, *size)
+    info.binning_x = info.binning_y = 2
+    found = calibration_of_info(info, "image_rect", tmp_path / "a.bag")
+    assert (found.fx, found.cx, found.width) == (250, principal[0] / 2, size[0] // 2)
 
 
 @pytest.mark.parametrize(("interlaced", "dropped"), [(True, ()), (False, ()), (False, (2, 5, 6, 9, 10, 11))])

@@ -156,8 +156,9 @@ class StampsLike:
         ([0, 33, 66, 150, 160], [0, 0.033, 0.066, 0.15, 0.16], None),  # variable rate
         ([0, 0, 0, 0], [0, 0.04, 0.08, 0.12], "the stated 25 frames"),
         ([0, 40, 80, 80, 60, 120], [0, 0.04, 0.08, 0.12], "dropped"),
+        ([0, 0.01, 0.02, 0.03], [0, 0.04, 0.08, 0.12], "states 25 frames a second: assuming the stated 25"),
     ],
-    ids=["variable", "none", "backwards"],
+    ids=["variable", "none", "backwards", "hasty"],
 )
 def test_times_of_the_container(make, monkeypatch, milliseconds, times, warned):
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: StampsLike(milliseconds))
@@ -199,6 +200,31 @@ def test_parts_with_clocks_of_their_own(make, monkeypatch):
     stamps = [frame.timestamp for frame in frames]
     assert len(frames) >= 22 and (np.diff(stamps) > 0).all() and max(np.diff(stamps)[3:21]) < 0.05
     assert any("clock was set back before frame 12" in text for text in source.warnings)
+
+
+def test_short_parts_with_clocks_of_their_own(make, monkeypatch):
+    """Three frames in a row that are late show it; single ones, in another order than that of their times, do not."""
+    milliseconds = [*range(0, 400, 40), 390, 400, 420, 410, *range(440, 600, 40), *range(0, 400, 40)]
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: StampsLike(milliseconds))
+    source = open_source(make.video("a.avi", "MJPG", frames=2), calib=make.text("c.txt", "50 50 31.5 23.5"))
+    stamps = [frame.timestamp for frame in source]
+    assert len(stamps) == len(milliseconds) - 3 and (np.diff(stamps) > 0).all() and max(np.diff(stamps)) < 0.05
+    assert any("clock was set back before frame 20" in text for text in source.warnings)
+
+
+@pytest.mark.parametrize(("rate", "said"), [(0, "has no times: assuming"), (90_000, "states 90,000 frames a second")])
+def test_a_rate_that_no_camera_has(make, rate, said):
+    """Of none FFmpeg makes 25 a second, and of 90,000 a video that lasts no time."""
+    video = make.video("a.avi", "MJPG", frames=6)
+    data = bytearray(video.read_bytes())
+    struct.pack_into("<I", data, data.index(b"avih") + 8, 0)
+    struct.pack_into("<II", data, data.index(b"strh") + 28, 1, rate)
+    video.write_bytes(data)
+    source = open_source(video, calib=CALIB)
+    stamps = [frame.timestamp for frame in source]
+    assert said in source.warnings[0] and len(stamps) == 6
+    assert np.diff(stamps) == pytest.approx(1 / (30 if rate else 25), abs=1e-3)
+    assert [frame.timestamp for frame in open_source(video, calib=CALIB, fps=5)][1] == 0.2
 
 
 @pytest.mark.parametrize(("content", "what"), [

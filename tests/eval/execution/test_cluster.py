@@ -26,8 +26,8 @@ def test_ray_missing_and_packed_runs(job, tmp_path, image_folder, monkeypatch, p
     asked: list[str] = []
     monkeypatch.setattr(cluster.cluster.importlib, "import_module", lambda name: PretendedRay(asked))
     said: list[str] = []
-    predict_all(replace(plan, systems=("null",), ray="ray://head:1"), said.append)
-    assert asked == ["init ray://head:1", "cpus 1", "run 0", "run 1", "shutdown"]
+    predict_all(replace(plan, systems=("null",), ray="auto"), said.append)
+    assert asked == ["init auto", "cpus 1", "run 0", "run 1", "shutdown"]
     assert [text.split(": ")[1] for text in said] == ["20/20 frames"] * 2
 
     def absent(name: str):

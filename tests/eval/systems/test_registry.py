@@ -15,6 +15,7 @@ import pytest
 import dvo
 from dvo.core.errors import DvoError
 from dvo.odometry.protocol import Odometry
+from dvo.odometry.registry import SYSTEMS as WITHOUT_WEIGHTS
 from eval.execution.cache import digest_of, job_key, system_facts
 from eval.execution.predict import predict_here
 from eval.suites.suite import ROOT
@@ -27,6 +28,8 @@ TARGET = "dvo.odometry.classical.klt_pnp:KltPnp"
 def test_registry():
     names = [system.name for system in list_systems()]
     assert {"dvo-small", "klt-pnp", "null"} <= set(names)
+    for name, target in WITHOUT_WEIGHTS.registered.items():
+        assert find_system(name).target == target and "dvo." not in find_system(name).about
     for name in ("klt-pnp", "null"):
         system = find_system(name)
         assert system.missing() is None

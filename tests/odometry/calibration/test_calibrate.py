@@ -11,6 +11,7 @@ import dvo
 from dvo.core.errors import DvoError
 from dvo.data import read_calibration
 from dvo.data.calibration.focal_guess import FocalGuess, guess_from_angle
+from dvo.geometry.undistort import Undistorter
 from dvo.odometry.calibration.calibrate import CalibrationOptions, calibrate
 from dvo.odometry.calibration.camera_estimate import SelfCalibration
 from dvo.odometry.global_ba.focal_length import FocalProfile
@@ -72,6 +73,28 @@ def test_without_its_deviation_the_principal_point_is_the_middle(leaning):
     assert far.found and far.aside == (0.0, 0.0), "22 of 192 pixels are hardly possible"
     found, tracked = leaning(1.0, guess, aside=(sure, unsure), max_aside=0.0)
     assert found.aside == (0.0, 0.0) and len(str(found).splitlines()) == 1 and len(tracked) == 1
+
+
+def test_the_distortion_that_was_found_is_taken_from_the_images_of_the_next_round(clip, monkeypatch, tmp_path):
+    tracked = []
+
+    def track(frame):
+        tracked.append(frame)
+        return Estimate(frame.timestamp, None, Status.TRACKING)
+
+    bent = FocalProfile(Minimum(0.0, 0.01, 0.5), 0.5, FLAT, Minimum(0.4, 0.01, 0.5))
+    replace_tracking(monkeypatch, track, lambda: bent)
+    frames = [replace(frame, mask=np.ones((144, 192), bool)) for frame in clip]
+    options = CalibrationOptions(frames=30, spare=1000)
+    found = calibrate(frames, FocalGuess(100.0, 40.0, "prior", 192, 144), options=options)
+    assert len(tracked) == 60 and (found.bend, found.bend_deviation) == (0.4, pytest.approx(0.03))
+    undistorter = Undistorter(dvo.Camera(100.0, 100.0, 95.5, 71.5, 192, 144, "eucm", (0.4, 1.0)))
+    assert tracked[0].camera.intrinsics[0] == 100 and np.array_equal(tracked[0].image, clip[0].image)
+    assert tracked[30].camera == undistorter.camera and tracked[30].mask.shape == (144, 192)
+    assert np.array_equal(tracked[30].image, undistorter(clip[0].image))
+    assert str(found).splitlines()[1] == "barrel distortion: eucm, alpha 0.40 +- 0.03, beta 1"
+    assert found.write(tmp_path / "calib.txt")
+    assert read_calibration(tmp_path / "calib.txt").camera(192, 144) == found.calibration.camera(192, 144)
 
 
 @pytest.mark.slow
@@ -142,6 +165,27 @@ def test_the_secant_finds_the_fixed_point_of_measurements_that_lean(leaning, lea
     assert found.found and math.log(found.focal / 200) == pytest.approx(0, abs=1e-9)
 
 
+def test_a_round_that_tells_far_better_does_not_lean_as_the_one_before(clip, monkeypatch):
+    """Tracked with 256 px, the measurements ask for 160 px at a low contrast; with those, for what is right."""
+    asked = []
+
+    def track(frame):
+        if frame.index == 0:
+            asked.append(frame.camera.fx)
+        return Estimate(frame.timestamp, None, Status.TRACKING)
+
+    def profile():
+        right = len(asked) > 1
+        step = math.log((122 if right else 160) / asked[-1])
+        return FocalProfile(Minimum(step, 0.01, 0.5), 2.6 if right else 0.07, FLAT)
+
+    replace_tracking(monkeypatch, track, profile)
+    frames = [replace(clip[0], index=k, timestamp=k / 30) for k in range(60)]
+    options = CalibrationOptions(frames=30, spare=1000)
+    found = calibrate(frames, FocalGuess(256.0, 64.0, "prior", 192, 144), options=options)
+    assert found.focal == pytest.approx(122) and asked == pytest.approx([256, 160, 122])
+
+
 @pytest.mark.parametrize("share", [1.0, 0.5])
 def test_the_deviation_is_lengthened_with_the_step(leaning, share):
     found, tracked = leaning(share, FocalGuess(160.0, 40.0, "prior", 192, 144), floor=0.0)
@@ -184,6 +228,25 @@ def test_a_clip_that_does_not_tell_goes_on(clip, monkeypatch, told_at):
     assert all(index == k and focal == 200 for k, (index, focal) in enumerate(tracked[first:]))
 
 
+@pytest.mark.parametrize("second", [60, 119, 120])
+def test_a_last_round_too_short_to_tell_leaves_what_the_one_before_has_found(clip, monkeypatch, second):
+    """The first round has a curve in it. One as long that does not tell speaks against the one before."""
+    rounds = []
+
+    def profile():
+        rounds.append(len(rounds))
+        return FocalProfile(Minimum(0.2, 0.01, 0.5), 0.5 if len(rounds) == 1 else 0.001, FLAT)
+
+    track = lambda frame: Estimate(frame.timestamp, None, Status.TRACKING)  # noqa: E731
+    replace_tracking(monkeypatch, track, profile, lambda: (120, 120, second)[len(rounds)])
+    frames = [replace(clip[0], index=k, timestamp=k / 30) for k in range(120)]
+    found = calibrate(frames, FocalGuess(160.0, 40.0, "prior", 192, 144))
+    assert len(rounds) == 2 and found.found == (second < 120)
+    if found.found:
+        assert found.focal == pytest.approx(160 * math.exp(0.2)) and found.frames == 120
+        assert found.deviation > 0.1 * found.focal, "half of the last step may be left"
+
+
 def test_what_is_hardly_possible_is_judged_after_the_last_step(leaning):
     """Half of the way lies in the range of the guess, the whole of it does not."""
     narrow = FocalGuess(160.0, 160 * 0.05, "exif", 192, 144)  # 131 to 195 px
@@ -191,6 +254,13 @@ def test_what_is_hardly_possible_is_judged_after_the_last_step(leaning):
     assert not found.found and (found.focal, found.deviation) == (160.0, narrow.deviation)
     assert "fit 200 px best, which is hardly possible" in found.reason
     assert leaning(0.5, replace(narrow, deviation=160 * 0.06))[0].focal == pytest.approx(200, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("images", "focal"), [("tartanair_v1_60/image_left", 320), ("kitti00_120/image_0", 719)])
+def test_the_focal_length_of_a_real_clip_far_from_the_usual_one(data_root, images, focal):
+    found = calibrate(dvo.open(data_root / images, fps=10, guess=True))
+    assert found.found and found.focal == pytest.approx(focal, rel=0.05)
 
 
 def test_ignored_pixels_are_not_measured(clip):

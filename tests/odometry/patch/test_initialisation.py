@@ -83,9 +83,9 @@ def test_settings_turn_kernel_and_restart_off():
 @pytest.mark.parametrize("unit", [0.0, 1.0])
 @pytest.mark.parametrize("moving", [0, 6, 100])
 def test_a_first_window_is_updated_until_it_has_settled(moving, unit):
-    """A walk whose exact solution is shaken by the first updates."""
+    """A walk whose exact solution is shaken by the first updates; another start is judged by the flow of now."""
     graph, _ = archived_walk(frames=6, wrong=0.1, archived=False, unit=unit)
-    window, updates = graph.window, []
+    window, updates, asked = graph.window, [], []
     right = pose_at(0.1 * torch.arange(6, dtype=torch.float64)).float()
     window.confidence = window.weights
 
@@ -95,7 +95,12 @@ def test_a_first_window_is_updated_until_it_has_settled(moving, unit):
         shake[1:, 4] = 0.01 * (len(updates) % 2) * (len(updates) <= moving)
         window.poses_cw = se3.compose(se3.exp(shake), right)
 
+    def revise():
+        asked.append(len(updates))
+        return SimpleNamespace(targets=window.targets[None], weights=window.weights[None])
+
     config = TrackerConfig()
-    initialise(SimpleNamespace(window=window, step=step), config, 6)
+    initialise(SimpleNamespace(window=window, step=step, revise=revise), config, 6)
+    assert len(asked) == (not unit)
     settled = max(COLD_UPDATES, moving) + CALM
     assert len(updates) == min(settled, config.initial_updates)

@@ -635,10 +635,10 @@ class InertialEstimator:
         if self._drift or time < self._watched + CLOCK_EVERY or span < CLOCK_SPAN:
             return
         self._watched, early = time, mine.times <= mine.times[0] + span / 2
-        halves = [self._offset_by_turns(mine.where(half)[0]) for half in (early, ~early)]
-        if halves[0] is None or halves[1] is None:
+        first, second = (self._offset_by_turns(mine.where(half)[0]) for half in (early, ~early))
+        if first is None or second is None:
             return
-        (before, sigma), (after, other) = halves
+        (before, sigma), (after, other) = first, second
         rate, known = 2 * (after - before) / span, 2 * float(np.hypot(sigma, other)) / span
         if abs(rate) - 3 * known > MAX_DRIFT:
             self._drift = f"the clock of the samples drifts by {1000 * rate:.1f} ms a second"

@@ -104,8 +104,8 @@ def find_focal(
 
     Returns:
         The profile; that of the coarse steps alone where it is flat (:data:`MIN_CONTRAST`), or of no interest, then
-        with a contrast of 0. An infinite deviation if
-        the cost still falls at the end of the range, or for fewer than :data:`MIN_KEYFRAMES` frames.
+        with a contrast of 0. An infinite deviation if the cost still falls at the end of the range, or for fewer than
+        :data:`MIN_KEYFRAMES` frames.
     """
     frames = graph.members(segment)
     if len(frames) < MIN_KEYFRAMES:
@@ -206,7 +206,7 @@ def _along(first: tuple[float, ...], second: tuple[float, ...], third: tuple[flo
 
 
 def undistorted(points: Tensor, bend: float) -> Tensor:
-    """Inverse of the unified camera model (Usenko et al., 3DV 2018, eq. 13-15 with xi = 0 of the double sphere).
+    """Inverse of the unified camera model (as Usenko, Demmel, Cremers write it, 3DV 2018).
 
     Args:
         points: ``(..., 2)`` normalised coordinates of a lens with distortion.

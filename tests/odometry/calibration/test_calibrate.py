@@ -47,13 +47,13 @@ def test_the_focal_length_of_a_rendered_walk_is_found(clip, found):
 
 @pytest.mark.slow
 def test_the_principal_point_is_told_where_the_measurements_tell_it(clip):
-    """That of the rendered camera lies 3 pixels from the middle of the image."""
+    """That of the rendered camera lies 3 pixels from the middle of the image; more than half of that is found."""
     options = CalibrationOptions(spare=500, max_aside=0.015)
     camera, believed = clip[0].camera, options.max_aside * 192
     true = camera.cx - 95.5, camera.cy - 71.5
     assert math.hypot(*true) > 2
     found = calibrate(clip, FocalGuess(camera.fx, 0.3 * camera.fx, "given", 192, 144), options=options)
-    assert 0 < found.aside_deviation[0] <= believed and abs(found.aside[0] - true[0]) < 1.0
+    assert 0 < found.aside_deviation[0] <= believed and abs(found.aside[0] - true[0]) < abs(true[0]) / 2
     for value, deviation, wanted in zip(found.aside, found.aside_deviation, true, strict=True):
         assert value == 0 if math.isinf(deviation) else abs(value - wanted) < 3 * deviation
     assert str(found).splitlines()[1].startswith(f"principal point cx {95.5 + found.aside[0]:.1f} +- ")

@@ -188,7 +188,7 @@ def calibrate(
                 break
             if walk:  # back to the guess; tracked with it, the clip goes on from where it is
                 tracking = None
-            focal, aside, bend, wanted, walk = guess.focal, (0.0, 0.0), 0.0, 2 * wanted, []
+            focal, aside, bend, wanted, walk, believed = guess.focal, (0.0, 0.0), 0.0, 2 * wanted, [], None
             continue
         tracking, walk = None, asked
         before, (aside, unsure) = aside, _principal_point(profile, aside, focal, max(width, height), options)

@@ -228,9 +228,9 @@ def test_a_clip_that_does_not_tell_goes_on(clip, monkeypatch, told_at):
     assert all(index == k and focal == 200 for k, (index, focal) in enumerate(tracked[first:]))
 
 
-@pytest.mark.parametrize("second", [60, 119, 120])
-def test_a_last_round_too_short_to_tell_leaves_what_the_one_before_has_found(clip, monkeypatch, second):
-    """The first round has a curve in it. One as long that does not tell speaks against the one before."""
+@pytest.mark.parametrize(("counts", "found"), [((120, 60), True), ((120, 119), True), ((120, 120, 60), False)])
+def test_a_last_round_too_short_to_tell_leaves_what_the_one_before_has_found(clip, monkeypatch, counts, found):
+    """The first round has a curve in it. One as long that does not tell speaks against the one before, for good."""
     rounds = []
 
     def profile():
@@ -238,13 +238,14 @@ def test_a_last_round_too_short_to_tell_leaves_what_the_one_before_has_found(cli
         return FocalProfile(Minimum(0.2, 0.01, 0.5), 0.5 if len(rounds) == 1 else 0.001, FLAT)
 
     track = lambda frame: Estimate(frame.timestamp, None, Status.TRACKING)  # noqa: E731
-    replace_tracking(monkeypatch, track, profile, lambda: (120, 120, second)[len(rounds)])
+    replace_tracking(monkeypatch, track, profile, lambda: (counts[0], *counts)[len(rounds)])
     frames = [replace(clip[0], index=k, timestamp=k / 30) for k in range(120)]
-    found = calibrate(frames, FocalGuess(160.0, 40.0, "prior", 192, 144))
-    assert len(rounds) == 2 and found.found == (second < 120)
-    if found.found:
-        assert found.focal == pytest.approx(160 * math.exp(0.2)) and found.frames == 120
-        assert found.deviation > 0.1 * found.focal, "half of the last step may be left"
+    options = CalibrationOptions(spare=1000)
+    told = calibrate(frames, FocalGuess(160.0, 40.0, "prior", 192, 144), options=options)
+    assert len(rounds) == len(counts) and told.found == found
+    if found:
+        assert told.focal == pytest.approx(160 * math.exp(0.2)) and told.frames == 120
+        assert told.deviation > 0.1 * told.focal, "half of the last step may be left"
 
 
 def test_what_is_hardly_possible_is_judged_after_the_last_step(leaning):

@@ -139,7 +139,7 @@ def _poisoned(kind: str, recording: Recording) -> Recording:
 
 @pytest.mark.parametrize(
     ("kind", "word"),
-    [("g", "units"), ("degrees", "turn"), ("axes", "turn"), ("late", "offset of 104 ms"), ("dropped", "gyroscope")],
+    [("g", "units"), ("degrees", "turn"), ("axes", "turn"), ("late", "an offset of 10"), ("dropped", "gyroscope")],
 )
 def test_poisoned_samples_are_refused_with_the_reason(kind: str, word: str) -> None:
     estimator, reasons = drive(_poisoned(kind, record(3, seconds=6.0)))

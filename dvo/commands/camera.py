@@ -56,7 +56,7 @@ def with_calibration(
         written = (not file.exists() or CALIBRATION in files_of_run(folder)) and found.write(file)
         if not written:
             warn(f"{file} is not a file of an earlier run, and was not replaced")
-        source = source.recalibrated(found.calibration)
+        source = source.recalibrated(found.calibration, None if found.found else source.guess)
     elif CALIBRATION in files_of_run(folder) and not _is_given(file, source, arguments.calib):
         file.unlink(missing_ok=True)  # of an earlier run
     factor = 1 if source.reduction is None else source.reduction.factor

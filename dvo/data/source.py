@@ -96,7 +96,8 @@ class Source:
         reduction: of the recorded images; None for none.
         calibration: of the recorded images, as read; None for a stream.
         masks: of the recorded images; None for none.
-        guess: of the focal length, for a source without a calibration that was opened with one; None otherwise.
+        guess: of the focal length, for a source without a calibration that was opened with one, as long as nothing
+            better is known; None otherwise.
         turned: degrees clockwise by which frames are turned to stand upright, as a video or EXIF data ask for.
         stride: every how many-th frame is read.
         frame_count: frames to expect, the stride taken into account; None if a video does not say. A video's header may
@@ -132,17 +133,18 @@ class Source:
         """
         return type(self)(self.recording, replace(self.reading, **changes))
 
-    def recalibrated(self, calibration: Calibration) -> Self:
+    def recalibrated(self, calibration: Calibration, guess: FocalGuess | None = None) -> Self:
         """The same recording with another calibration.
 
         Args:
             calibration: of the images as recorded.
+            guess: that its focal length still is, where the images do not tell it.
 
         Raises:
             DvoError: intrinsics that do not fit the images.
         """
         camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
-        return self.changed(recorded_camera=camera, calibration=calibration, guess=None)
+        return self.changed(recorded_camera=camera, calibration=calibration, guess=guess)
 
     def at_recorded_size(self) -> Self:
         """The same recording, its images not reduced."""

@@ -17,6 +17,7 @@ from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
 from dvo.data.trajectory import Trajectory, interpolate
 from dvo.odometry.protocol import Break, Estimate, Interim, Odometry, Result
+from dvo.odometry.quality import without_calibration
 from dvo.odometry.segments import find_breaks, joined
 from dvo.session.second_run import compare_again, is_due
 
@@ -135,6 +136,8 @@ def run(
     else:
         result = odometry.finish()
     feeding.seconds["finishing"] = time.perf_counter() - started
+    if result.quality is not None and getattr(source, "guess", None) is not None:
+        result = replace(result, quality=without_calibration(result.quality))
     if again is not None and not interrupted and is_due(result, source):
         tell("checking")
         started = time.perf_counter()

@@ -7,6 +7,7 @@ import pytest
 
 import dvo
 from dvo.core.errors import DvoError
+from dvo.data.calibration.focal_guess import guess_from_angle
 from dvo.data.streams.live import LiveFrames
 from dvo.data.trajectory import Trajectory
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
@@ -164,6 +165,19 @@ def test_a_second_run_that_fails_or_is_stopped_leaves_the_first():
 
     done = ran(begin, should_stop=lambda: bool(pressed))
     assert done.result.quality.verdict == "good" and not other.times and len(done.result.trajectory) == 30
+
+
+def test_a_picture_that_moves_as_a_whole_is_doubtful_where_the_focal_length_is_a_guess():
+    class Clip(list):
+        guess = None
+
+    flat, clip = replace(SURE, relief=0.01), Clip(frames(5))
+    assert dvo.run(Walk(quality=flat), clip).result.quality.verdict == "good"
+    clip.guess = guess_from_angle(64, 48)
+    quality = dvo.run(Walk(quality=flat), clip).result.quality
+    assert quality.verdict == "doubtful" and "moves as a whole" in quality.reason and "calibration" in quality.remedy
+    for relief in (0.2, np.nan):
+        assert dvo.run(Walk(quality=replace(SURE, relief=relief)), clip).result.quality.verdict == "good"
 
 
 def test_what_arrives_once_is_not_read_again():

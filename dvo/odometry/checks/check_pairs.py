@@ -6,13 +6,14 @@ confidence, or that follows something else than the scene, does not agree with t
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
 
-from dvo.geometry import se3
+from dvo.geometry import se3, so3
 
 CORNERS = 120
 """Largest number of corners of a pair."""
@@ -29,6 +30,9 @@ WINDOW = (15, 15)
 """Pixels around a corner by which it is followed."""
 RETURN = 0.4
 """Largest distance of a corner from where it was, followed forward and back, pixels."""
+
+
+_ROUNDS, _NOISE = 20, 0.05  # of the fit of a similarity, and of a corner, pixels
 
 
 @dataclass(frozen=True)
@@ -127,6 +131,46 @@ def median_displacement(points: np.ndarray) -> float:
         0 without corners.
     """
     return float(np.median(np.linalg.norm(points[:, 2:] - points[:, :2], axis=1))) if len(points) else 0.0
+
+
+def relief(pair: CheckPair, first_cw: np.ndarray, second_cw: np.ndarray) -> float:
+    """How far the corners of a pair are from moving as a whole, over the parallax that the poses give them.
+
+    A shift, a turn in the plane of the image and a zoom are fitted to the corners; what they leave is relief, or the
+    perspective of a turn. A camera on a tripod that turns or zooms with a long lens leaves next to nothing, and so does
+    one that moves before a flat picture: with an unknown focal length the two are the same.
+
+    Args:
+        pair: corners.
+        first_cw, second_cw: ``(7,)`` poses ``T_cw`` of its frames.
+
+    Returns:
+        Median distance from the fit, over the median length of what the rotation does not explain; NaN where that is
+        less than the first of :data:`DISPLACEMENTS`.
+    """
+    fx, fy, cx, cy = pair.intrinsics
+    points = pair.points.astype(np.float64)
+    rays = torch.from_numpy(np.column_stack([(points[:, 0] - cx) / fx, (points[:, 1] - cy) / fy, np.ones(len(points))]))
+    turn = se3.relative(*(torch.as_tensor(pose, dtype=torch.float64) for pose in (first_cw, second_cw)))[3:]
+    turned = so3.rotate(turn.expand(len(rays), 4), rays).numpy()
+    parallax = points[:, 2:] - turned[:, :2] / turned[:, 2:] * (fx, fy) - (cx, cy)
+    length = float(np.median(np.linalg.norm(parallax, axis=1)))
+    if not length >= DISPLACEMENTS[0]:
+        return math.nan
+    return float(np.median(_off_similarity(points))) / length
+
+
+def _off_similarity(points: np.ndarray) -> np.ndarray:
+    """Distances ``(N,)`` of corners ``(N, 4)`` from the similarity that most of them follow, pixels."""
+    first, second = (points[:, k] + 1j * points[:, k + 1] for k in (0, 2))
+    weights = np.ones(len(points))
+    for _ in range(_ROUNDS):
+        weights = weights / weights.sum()
+        a, b = first - weights @ first, second - weights @ second
+        factor = (weights * a.conj()) @ b / max(float(weights @ np.abs(a) ** 2), 1e-12)
+        distances = np.abs(b - factor * a)
+        weights = 1 / (distances**2 + max(float(np.median(distances)), _NOISE) ** 2)
+    return distances
 
 
 def epipolar_distances(pair: CheckPair, first_cw: np.ndarray, second_cw: np.ndarray) -> np.ndarray:

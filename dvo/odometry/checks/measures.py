@@ -15,7 +15,7 @@ from dvo.geometry import se3, so3
 from dvo.geometry.projection import reproject
 from dvo.map.map import Map
 from dvo.map.recordings import increasing_times
-from dvo.odometry.checks.check_pairs import CheckPair, CheckPairs, epipolar_distances, median_displacement
+from dvo.odometry.checks.check_pairs import CheckPair, CheckPairs, epipolar_distances, median_displacement, relief
 from dvo.odometry.checks.floating_crop import looked_at, shift_gain
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.protocol import Result
@@ -85,6 +85,8 @@ def measure_quality(
         agreed = float((distances < NEAR_LINE).mean())
         quality = replace(quality, checks=len(pairs), deviation=deviation, check=agreed)
         quality = replace(quality, crop=_shift_gain(graph, placed, shutter, stride))
+        reliefs = [value for pair, *poses in placed if not math.isnan(value := relief(pair, *poses))]
+        quality = replace(quality, relief=float(np.median(reliefs)) if reliefs else math.nan)
     quality = replace(quality, still=_still(graph, checks))
     verdict, reason, remedy = judge(quality, result.frames_read, cause)
     return replace(quality, verdict=verdict, reason=reason, remedy=remedy)

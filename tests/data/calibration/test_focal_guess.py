@@ -122,4 +122,5 @@ def test_a_source_is_opened_with_a_guess_and_gets_a_calibration(make):
     assert source.guess.source == "prior" and source.camera.fx == source.guess.focal
     again = source.recalibrated(guess_from_metadata(20.0, "given", 64, 48).calibration)
     assert again.guess is None and [f.camera.fx for f in again] == pytest.approx([20 / 43.2666 * 80] * 2, rel=1e-4)
+    assert source.recalibrated(source.guess.calibration, source.guess).guess == source.guess
     assert open_source(folder, guess=True, calib=make.calib(), fps=10).guess is None

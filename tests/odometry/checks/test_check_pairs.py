@@ -17,6 +17,7 @@ from dvo.odometry.checks.check_pairs import (
     CheckPairs,
     epipolar_distances,
     followed,
+    relief,
 )
 
 K = np.array([200.0, 190.0, 80.0, 60.0])
@@ -132,3 +133,29 @@ def test_corners_across_the_lines_of_a_motion_to_the_side():
     square = np.array([200.0, 200.0, 80.0, 60.0])
     pair = CheckPair(0, 1, np.hstack([points, points + [15, 9]]), square)
     np.testing.assert_allclose(epipolar_distances(pair, first, second), 9 / np.sqrt(2))
+
+
+@given(turn=st.floats(-0.15, 0.15), zoom=st.floats(0.95, 1.05), longer=st.floats(4.0, 8.0))
+@settings(max_examples=20, deadline=None)
+def test_a_turn_and_a_zoom_on_a_tripod_leave_no_relief(turn, zoom, longer):
+    """Poses that explain it by a shift in front of a wall, as with a guessed focal length."""
+    rng = np.random.default_rng(0)
+    first = rng.uniform([10, 10], [150, 110], (60, 2))
+    rays = np.column_stack([(first - K[2:]) / K[:2] / longer, np.ones(60)])
+    rays = rays @ cv2.Rodrigues(np.array([0.0, turn / longer, 0.0]))[0].T
+    second = zoom * longer * rays[:, :2] / rays[:, 2:] * K[:2] + K[2:]
+    points = np.column_stack([first, second + rng.normal(0, 0.03, (60, 2))]).astype(np.float32)
+    points[:12, 2:] += rng.uniform(-30, 30, (12, 2))  # what moves before it
+    still, moved = np.array([0.0, 0, 0, 0, 0, 0, 1]), np.array([0.1, 0, 0, 0, 0, 0, 1])
+    found = relief(CheckPair(0, 4, points, K), still, moved)
+    assert np.isnan(found) or found < 0.03
+
+
+def test_a_scene_has_relief():
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-1, -0.6, 2], [1, 0.6, 6], (80, 3))
+    first, second = (x[:, :2] / x[:, 2:] * K[:2] + K[2:] for x in (points, points + [0.3, 0, 0]))
+    pair = CheckPair(0, 4, np.column_stack([first, second]).astype(np.float32), K)
+    still, moved = np.array([0.0, 0, 0, 0, 0, 0, 1]), np.array([0.3, 0, 0, 0, 0, 0, 1])
+    assert relief(pair, still, moved) > 0.1
+    assert np.isnan(relief(CheckPair(0, 4, np.tile(first, 2).astype(np.float32), K), still, still))

@@ -9,7 +9,8 @@ Images and masks alone are tracked: with measured depths there is no second solu
 Measurements may fit a wrong motion nearly as well as the right one: of a flat scene, say, or a picture of which little
 moves. Which of them a run finds is then a matter of chance and of where it begins, so that two runs differ. Runs that
 agree prove nothing: what is fixed to the camera holds them all. Nor does one that fits its own measurements clearly
-worse, unless it is doubtful by itself: it then is the one that went wrong.
+worse, unless it is doubtful by itself: it then is the one that went wrong. One that fits them better, or as well and is
+doubtful by itself, leaves doubt by a smaller difference.
 """
 
 from __future__ import annotations
@@ -39,9 +40,10 @@ MAX_PIXELS = 640 * 480
 MAX_DIFFERENCE = 3.0
 """Largest RMS difference of the two after a similarity, percent of the path."""
 MAX_DISPUTED = 1.0
-"""Largest RMS difference of a third run and the first, percent of the path, with which they outvote the second."""
+"""Largest RMS difference, percent of the path, of two runs that are one solution: of a third run and the first, which
+then outvote the second, and of the first and a second one that is at least as good."""
 MAX_RESIDUAL_RATIO = 1.25
-"""Residual of a good second run over that of the first above which their difference says nothing about the first."""
+"""Residual of a second run over that of the first above which it fits its measurements worse."""
 
 
 def can_be_read_again(source: object) -> bool:
@@ -81,7 +83,8 @@ def compare_again(
         should_stop: called before each frame; True ends the second run, and what it has is compared.
 
     Returns:
-        The quality with the difference. It is doubtful if the difference is large, unless the second run is good and
+        The quality with the difference. It is doubtful if the difference is large (a smaller one is enough where the
+        second run fits its measurements better, or as well and is doubtful itself), unless the second run is good and
         fits its measurements worse, or fits them no better and a third run agrees with the first; and if the second
         run finds no motion to compare where the first one has.
     """
@@ -101,10 +104,14 @@ def compare_again(
     if np.isnan(difference) and not stopped and _has_begun(mine, kept):
         reason = "a second run, backward with another seed, finds no motion"
         return replace(mine, verdict="doubtful", reason=reason, remedy=FILM)
-    worse = other is not None and other.verdict == "good" and other.residual > MAX_RESIDUAL_RATIO * mine.residual
-    if worse or not difference > MAX_DIFFERENCE:  # NaN: nothing is known
+    better = other is not None and other.residual < mine.residual
+    worse = other is not None and other.residual > MAX_RESIDUAL_RATIO * mine.residual
+    sure = other is not None and other.verdict == "good"
+    # Two runs that fit their measurements alike, one of them doubtful, have found two solutions.
+    most = MAX_DISPUTED if better or not (sure or worse) else MAX_DIFFERENCE
+    if sure and worse or not difference > most:  # NaN: nothing is known
         return replace(mine, second=difference)
-    if other is None or not other.residual < mine.residual:
+    if most == MAX_DIFFERENCE:
         third, stopped = _tracked(build(2), kept, should_stop)
         if not stopped and _difference(third.trajectory, result.trajectory) <= MAX_DISPUTED:
             return replace(mine, second=difference)

@@ -121,6 +121,18 @@ def test_a_second_run_that_fits_better_is_not_outvoted():
         assert quality.verdict == verdict and quality.second > 3 and bool(walks) is (verdict == "doubtful")
 
 
+def test_a_second_run_that_is_as_good_leaves_doubt_by_a_smaller_difference():
+    """It fits its measurements better, or as well and is doubtful by itself."""
+    first = replace(UNSURE, residual=0.3)
+    for bend, own, residual, verdict in (
+        (0.01, "good", 0.28, "good"), (0.07, "good", 0.28, "doubtful"), (0.07, "good", 0.32, "good"),
+        (0.07, "doubtful", 0.32, "doubtful"), (0.07, "doubtful", 0.4, "good"), (0.01, "doubtful", 0.32, "good"),
+    ):  # fmt: skip
+        again = Walk(bend, quality=replace(UNSURE, verdict=own, residual=residual))
+        quality = ran(lambda number, again=again: again, first=first).result.quality
+        assert quality.verdict == verdict and (1 < quality.second < 3 if bend > 0.05 else quality.second < 1)
+
+
 def test_frames_with_equal_times_are_an_error_of_the_library_or_none():
     """The first run ends before them; the second one meets them."""
     twice = frames(30)

@@ -9,6 +9,10 @@ import numpy as np
 from dvo.core.errors import DvoError
 
 
+LEAST_NOISE, MOST_NOISE = 1e-12, 1e6
+"""Bounds of each number of :class:`ImuNoise`: without noise the information of a measurement is infinite."""
+
+
 @dataclass(frozen=True)
 class ImuNoise:
     """Noise densities; the defaults are those of the ADIS16448 in EuRoC's calibration (Burri et al., 2016).
@@ -21,7 +25,7 @@ class ImuNoise:
         gyro_bias, accel_bias: standard deviation of the initial bias, rad/s and m/s^2.
 
     Raises:
-        DvoError: no finite numbers of at least 0.
+        DvoError: no numbers within :data:`LEAST_NOISE` and :data:`MOST_NOISE`.
     """
 
     gyro: float = 1.6968e-4
@@ -35,9 +39,9 @@ class ImuNoise:
         for name in fields(self):
             value = getattr(self, name.name)
             is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-            if not is_number or not 0 <= value < np.inf:
-                message = f"is {str(value)[:60]}"
-                raise DvoError(message, field=f"inertial: noise.{name.name}", remedy="give a number of at least 0")
+            if not is_number or not LEAST_NOISE <= value <= MOST_NOISE:
+                remedy = f"give a number above 0, {LEAST_NOISE:g} to {MOST_NOISE:g}"
+                raise DvoError(f"is {str(value)[:60]}", field=f"inertial: noise.{name.name}", remedy=remedy)
 
 
 NOISE_PRESETS: dict[str, ImuNoise] = {

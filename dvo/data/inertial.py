@@ -8,7 +8,6 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 
-
 LEAST_NOISE, MOST_NOISE = 1e-12, 1e6
 """Bounds of each number of :class:`ImuNoise`: without noise the information of a measurement is infinite."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -22,6 +22,8 @@ from dvo.data.recording import Recording, Request
 AUTO, NONE = "auto", "none"
 """Values of ``imu`` that are no files: the samples of the recording, and none."""
 
+_COVERED = 0.9  # share of the time of the frames below which a note tells
+_CONSTANT = 20  # samples that should differ
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv")
 _NAMES = ("gyro_accel.csv", "imu.csv", "data.jsonl", "Gyroscope.csv")  # of MARS logger, Stray Scanner, Spectacular AI
 
@@ -53,7 +55,7 @@ class InertialInput:
         samples = self.calibration.applied(self.read())
         if self.span is not None:
             check_overlap(samples, self.span, self.file)
-        return samples
+        return replace(samples, notes=(*samples.notes, *_remarks(samples, self.span)))
 
     def rough(self) -> InertialSamples:
         """The samples as they stand, for a check: neither sorted nor refused for their times or units.
@@ -162,6 +164,21 @@ def check_overlap(samples: InertialSamples, span: tuple[float, float | None], fi
             f"inertial samples from {start:.6f} to {end:.6f} s do not meet the frames {frames}", file=file, field="imu",
             remedy="give times of the frames on the clock of the samples with --times, or time_offset in --imu-calib",
         )  # fmt: skip
+
+
+def _remarks(samples: InertialSamples, span: tuple[float, float | None] | None) -> list[str]:
+    """Sentences about samples that are read as they should be, and of little use."""
+    start, end, notes = float(samples.timestamps[0]), float(samples.timestamps[-1]), list[str]()
+    if span is not None and span[1] is not None and span[1] > span[0]:
+        covered = (min(end, span[1]) - max(start, span[0])) / (span[1] - span[0])
+        if covered < _COVERED:
+            whole = f"{100 * covered:.0f} % of the frames from {span[0]:.3f} to {span[1]:.3f} s"
+            notes.append(f"inertial samples from {start:.3f} to {end:.3f} s cover {whole}")
+    for name, rows in (("gyroscope", samples.gyro), ("accelerometer", samples.accel)):
+        if len(rows) > _CONSTANT and (rows == rows[0]).all():
+            values = ", ".join(f"{value:.4g}" for value in rows[0])
+            notes.append(f"the {name} is {values} in all samples: check that it is on, and its columns")
+    return notes
 
 
 def imu_calibration_of(

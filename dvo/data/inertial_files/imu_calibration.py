@@ -18,7 +18,7 @@ from dvo.core.yaml_files import read_text
 from dvo.data.calibration.documents import load_yaml
 from dvo.data.extrinsics import pose_of_numbers
 from dvo.data.files.files import is_file
-from dvo.data.inertial import LEAST_NOISE, NOISE_PRESETS, ImuNoise, InertialSamples
+from dvo.data.inertial import LEAST_NOISE, LONGEST_ARM, NOISE_PRESETS, ImuNoise, InertialSamples
 from dvo.geometry.poses import compose_poses, invert_poses
 
 NOISE_FACTOR = 1.0
@@ -38,7 +38,6 @@ _DENSITIES = {
 }
 """Names of Kalibr and of EuRoC's ``sensor.yaml``; units rad/s/sqrt(Hz), rad/s^2/sqrt(Hz), m/s^2/sqrt(Hz) and
 m/s^3/sqrt(Hz)."""
-_LONGEST_ARM = 10.0  # metres: numbers above it are millimetres
 _LARGEST = 1e30  # of a number
 _OWN = {field.name for field in fields(ImuNoise)}
 _OTHER = re.compile(  # entries of the same files that say nothing of the inertial sensor
@@ -126,7 +125,7 @@ def _read(given: str) -> ImuCalibration:
     entries = _Entries(_flat(data, camera, path), path)
     found = _of_entries(entries)
     entries.check_used()
-    if found.T_camera_imu is not None and np.linalg.norm(found.T_camera_imu[:3]) > _LONGEST_ARM:
+    if found.T_camera_imu is not None and np.linalg.norm(found.T_camera_imu[:3]) > LONGEST_ARM:
         message = f"the sensor is {np.linalg.norm(found.T_camera_imu[:3]):.4g} m from the camera"
         raise DvoError(message, file=path, field="T_camera_imu", remedy="give metres")
     if found.noise is None and found.T_camera_imu is None and found.time_offset is None:

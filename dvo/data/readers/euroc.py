@@ -8,6 +8,7 @@ TUM-VI has the same layout with Kalibr's ``T_cam_imu``, the inverse, in ``dso/ca
 
 from __future__ import annotations
 
+import math
 import re
 from array import array
 from functools import partial
@@ -175,7 +176,7 @@ def _inertial(mav: Path, camera: str, request: Request, *, rough: bool = False) 
     given, offset = request.imu_calibration, None
     if (given is None or given.time_offset is None) and (kalibr := _kalibr_camera(mav, camera)) is not None:
         offset = kalibr[0].get("timeshift_cam_imu")
-        if offset is not None and not isinstance(offset, int | float):
+        if offset is not None and not (isinstance(offset, int | float) and math.isfinite(offset)):
             field = f"{camera}.timeshift_cam_imu"
             raise DvoError("no number", file=kalibr[1], field=field, remedy="give seconds, t_imu - t_cam")
     calibration, table = ImuCalibration(noise, T_camera_imu, offset), mav / "imu0" / "data.csv"

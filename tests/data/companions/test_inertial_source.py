@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,21 @@ def test_none_gives_none(make, video):
     assert source.inertial is None and next(iter(source)).inertial is None
     with pytest.raises(DvoError, match="imu_calib: there are no inertial samples"):
         open_(video, imu="none", imu_calib="phone")
+
+
+@pytest.mark.parametrize(
+    ("start", "count", "told"), [(0.0, 50, "cover 49 %"), (0.7, 120, "cover 3. %"), (0.0, 120, "")]
+)
+def test_samples_of_a_part_of_the_frames_are_told(make, video, start, count, told):
+    make.text("other.csv", table(start, count))
+    notes = [note for note in open_(video, imu="other.csv").warnings if "cover" in note]
+    assert len(notes) == bool(told) and all(re.search(told, note) for note in notes)
+
+
+def test_a_sensor_that_is_off_is_told(make, video):
+    make.text("other.csv", re.sub(r"(?m)^([0-9.]+),[0-9]+,", r"\1,0,", table()))
+    notes = [note for note in open_(video, imu="other.csv").warnings if "in all samples" in note]
+    assert any(note.startswith("the gyroscope is 0, 0, 0 in all samples") for note in notes)
 
 
 @pytest.mark.parametrize("start", [100.0, -50.0])

@@ -9,7 +9,7 @@ import numpy as np
 
 from dvo.data.files.files import MAX_NUMBER
 from dvo.data.inertial import InertialSamples
-from dvo.data.inertial_files.tables import turn_of_gravity
+from dvo.data.inertial_files.tables import RATES, SLOW, turn_of_gravity
 from dvo.data.inertial_files.tidy import GRAVITY_RANGE, STANDARD_GRAVITY
 from dvo.odometry.inertial.findings import Finding, Found, Level
 from dvo.odometry.inertial.temporal import MAX_GAP, integrate_gyro
@@ -25,6 +25,8 @@ GRAVITY_ERROR = (0.4, 2.0)
 """Deviation of the force at rest from gravity that is told, and that makes samples unusable, m/s^2."""
 GYRO_BIAS = (0.1, 0.35)
 """Bias of the gyroscope that is told, and that makes samples unusable, rad/s."""
+FASTEST = 70.0
+"""Median of the angular rate that no sensor measures, rad/s: 4000 degrees a second."""
 NOISE_RATIO = (0.1, 3.0)
 """Measured over stated density that is told."""
 REST = (0.012, 0.015)
@@ -113,7 +115,11 @@ def _rhythm(times: Array) -> Found:
     }  # fmt: skip
     if 1 / spacing < MIN_RATE[1]:
         level = Level.UNUSABLE if 1 / spacing < MIN_RATE[0] else Level.WARNING
-        findings.append(Finding("low rate", level, f"{1 / spacing:.3g} samples a second", "record at 100 to 400 Hz"))
+        remedy = "record at 100 to 400 Hz" + (", and check the unit of the times" if 1 / spacing < SLOW else "")
+        findings.append(Finding("low rate", level, f"{1 / spacing:.3g} samples a second", remedy))
+    if 1 / spacing > RATES[1]:
+        text, remedy = f"{1 / spacing:.4g} samples a second", "check the unit of the times"
+        findings.append(Finding("high rate", Level.UNUSABLE, text, remedy))
     if share > MISSING[0]:
         level = Level.UNUSABLE if share > MISSING[1] else Level.WARNING
         text = f"{100 * share:.3g} % of the samples are not there, at {1 / spacing:.4g} Hz"
@@ -167,6 +173,10 @@ def _in_units(samples: InertialSamples) -> tuple[InertialSamples, Found]:
     if ratio is not None and 0.5 < np.rad2deg(ratio) < 2:
         samples, finding = in_radians(samples, f"gravity turns {1 / ratio:.3g} times slower than it says")
         findings.append(finding)
+    rate = float(np.median(np.linalg.norm(samples.gyro, axis=1)))
+    if rate > FASTEST and not any(finding.name == "gyroscope unit" for finding in findings):
+        text = f"the median of the gyroscope is {rate:.4g} rad/s, which no sensor measures"
+        findings.append(Finding("gyroscope unit", Level.UNUSABLE, text, "give it in rad/s; counts are no unit"))
     return samples, Found(values, tuple(findings))
 
 

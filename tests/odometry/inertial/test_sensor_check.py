@@ -215,6 +215,31 @@ def test_low_rates(rate: float) -> None:
     assert report.is_usable == (rate > 20)
 
 
+def test_rates_of_another_unit() -> None:
+    imu, times, rotations = good()
+    slow = check_sensor(replace(imu, timestamps=imu.timestamps * 1e3)).named("low rate")
+    assert slow is not None and "0.1 samples a second" in slow.text and "unit of the times" in slow.remedy
+    fast = check_sensor(replace(imu, timestamps=imu.timestamps / 1e3), times, rotations)
+    finding = fast.named("high rate")
+    assert finding is not None and "unit of the times" in finding.remedy and not fast.is_usable
+
+
+def test_counts_of_a_gyroscope() -> None:
+    report = checked(gyro=np.rint(np.degrees(good()[0].gyro) * 131))
+    finding = report.named("gyroscope unit")
+    assert finding is not None and "counts" in finding.remedy and not report.is_usable
+
+
+@pytest.mark.parametrize("jump", [1e5, 1.7e9])
+def test_a_clock_that_jumps_costs_no_memory(jump: float) -> None:
+    imu, times, rotations = good()
+    stamps = np.where(np.arange(len(imu)) < 50, imu.timestamps - jump, imu.timestamps)
+    report = check_sensor(replace(imu, timestamps=stamps), times, rotations)
+    assert report.named("gaps") is not None and abs(report.values["time offset, ms"]) < 1
+    stamps = np.where(np.arange(len(imu)) < 50, imu.timestamps, imu.timestamps + jump)
+    assert check_sensor(replace(imu, timestamps=stamps), times, rotations).named("not told") is not None
+
+
 def test_samples_in_bursts() -> None:
     imu = good()[0]
     stamps = np.arange(len(imu)) // 10 * 0.1 + np.arange(len(imu)) % 10 * 1e-5

@@ -39,6 +39,8 @@ RATES = (15.0, 5000.0)
 """Samples a second of an inertial sensor; the units of time differ by more than the ratio."""
 SLOW = 1.0
 """Samples a second from which slower ones are those of a logger, and not of another unit."""
+TURN_RATIO = (0.13, 7.5)
+"""Turn of gravity over that of the gyroscope: half way to another unit."""
 REMEDY = (
     "give a table whose header names time, gyroscope and accelerometer with their units, such as "
     "'time [ns], gx [rad/s], gy [rad/s], gz [rad/s], ax [m/s^2], ay [m/s^2], az [m/s^2]'"
@@ -48,7 +50,6 @@ _APPLE = re.compile(r"alpha_[xyz]$|accelerometerAcceleration[XYZ]")  # Stray Sca
 _PARTNERS = ("TotalAcceleration", "AccelerometerUncalibrated", "Accelerometer")  # of Sensor Logger, in this order
 _XSENS = {"0.1 ms": 10**4, "us": 10**6}  # units of SampleTimeFine, of MT and of DOT
 _SMOOTH = 0.2  # seconds over which gravity is averaged where it is compared with the gyroscope
-_TURN_RATIO = (0.13, 7.5)  # of the turn of gravity to that of the gyroscope: half way to another unit
 _TELLS = 0.3  # share of the change of gravity that the gyroscope explains
 _FASTEST = 20.0  # rad/s: numbers of the gyroscope that exceed it are degrees
 _PREAMBLE = 100  # lines among which the header is
@@ -478,7 +479,7 @@ def _rate_unit(gyro: _Sensor, accel: _Sensor, path: Path) -> tuple[float, list[s
     """Factor to rad/s, and a note if it is a guess, or if gravity turns otherwise."""
     ratio = turn_of_gravity(gyro.times, gyro.values, accel.times, accel.values)
     if gyro.factor is not None:
-        if ratio is None or _TURN_RATIO[0] <= ratio / gyro.factor <= _TURN_RATIO[1]:
+        if ratio is None or TURN_RATIO[0] <= ratio / gyro.factor <= TURN_RATIO[1]:
             return gyro.factor, []
         note = f"the stated unit of the gyroscope does not fit: gravity turns {ratio / gyro.factor:.3g} times as fast"
         return gyro.factor, [f"{path.name}: {note}; see dvo imu check"]
@@ -486,7 +487,7 @@ def _rate_unit(gyro: _Sensor, accel: _Sensor, path: Path) -> tuple[float, list[s
     if ratio is not None:
         name = "rad/s" if ratio > 0.13 else "deg/s"  # half way between 1 and pi / 180
         reason = "as gravity turns"
-        if not _TURN_RATIO[0] <= ratio / RATE_UNITS[name] <= _TURN_RATIO[1]:
+        if not TURN_RATIO[0] <= ratio / RATE_UNITS[name] <= TURN_RATIO[1]:
             message = f"the gyroscope is neither in rad/s nor in deg/s: gravity turns {ratio:.3g} times as fast"
             remedy = "name its unit in the header, such as 'gx [rad/s]'; counts of the sensor are none"
             raise DvoError(message, file=path, field="gyro", remedy=remedy)

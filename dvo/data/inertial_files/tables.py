@@ -178,9 +178,9 @@ def _partner(path: Path, sensor: str) -> Path:
     if len(found) != 1:
         what = "several files" if found else "no file"
         message = f"only the {_noun(sensor)} in it, and {what} of the {_noun(other)} beside it"
-        names = [] if found or other != "accel" else [*without_gravity(_text(path).header)[:1], *_linear(there)]
-        if names:
-            message = f"gravity was removed from {names[0]}, and there is no other accelerometer"
+        linear = [] if found or other != "accel" else [*without_gravity(_text(path).header)[:1], *_linear(there)]
+        if linear:
+            message = f"gravity was removed from {linear[0]}, and there is no other accelerometer"
             raise DvoError(message, file=path, field=other, remedy=_NO_GRAVITY)
         raise DvoError(message, file=path, field=other, remedy=REMEDY)
     return found[0]

@@ -25,7 +25,7 @@ from dvo.synth.motion.motion import Sway
 from dvo.synth.sensors.imu import GRAVITY, measure_imu
 
 FRAMES, PATCHES, METRES = 5, 6, 2.0  # METRES are one unit of the poses
-NOISE = ImuNoise(gyro_bias=0.0, accel_bias=0.0)
+NOISE = ImuNoise(gyro_bias=1e-9, accel_bias=1e-9)
 EXTRINSICS = np.array([0.0, 0, 0, 0, 0, 0, 1])  # the sensor is at the camera
 
 

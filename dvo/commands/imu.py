@@ -107,7 +107,7 @@ def _opened(arguments: argparse.Namespace) -> tuple[Source | None, InertialInput
 
 
 def _refusal(given: InertialInput) -> Finding | None:
-    """Finding that other commands refuse the samples, or repair them."""
+    """Finding that other commands refuse the samples, or read them with notes."""
     try:
         notes = given.samples.notes
     except DvoError as error:
@@ -115,7 +115,7 @@ def _refusal(given: InertialInput) -> Finding | None:
         return Finding("refused", Level.UNUSABLE, f"dvo run would not read them: {error.message}", remedy)
     if not notes:
         return None
-    return Finding("repaired", Level.NOTE, "; ".join(notes), "compare with what was recorded")
+    return Finding("notes", Level.NOTE, "; ".join(notes), "compare with what was recorded")
 
 
 def _seen(source: Source, arguments: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:

@@ -7,6 +7,12 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.data.files.files import MAX_NUMBER
+
+LONGEST_ARM = 10.0
+"""Metres from camera to sensor: numbers above it are millimetres."""
+LEAST_NOISE, MOST_NOISE = 1e-12, 1e6
+"""Bounds of each number of :class:`ImuNoise`: without noise the information of a measurement is infinite."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +27,7 @@ class ImuNoise:
         gyro_bias, accel_bias: standard deviation of the initial bias, rad/s and m/s^2.
 
     Raises:
-        DvoError: no finite numbers of at least 0.
+        DvoError: no numbers within :data:`LEAST_NOISE` and :data:`MOST_NOISE`.
     """
 
     gyro: float = 1.6968e-4
@@ -35,9 +41,9 @@ class ImuNoise:
         for name in fields(self):
             value = getattr(self, name.name)
             is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-            if not is_number or not 0 <= value < np.inf:
-                message = f"is {str(value)[:60]}"
-                raise DvoError(message, field=f"inertial: noise.{name.name}", remedy="give a number of at least 0")
+            if not is_number or not LEAST_NOISE <= value <= MOST_NOISE:
+                remedy = f"give a number above 0, {LEAST_NOISE:g} to {MOST_NOISE:g}"
+                raise DvoError(f"is {str(value)[:60]}", field=f"inertial: noise.{name.name}", remedy=remedy)
 
 
 NOISE_PRESETS: dict[str, ImuNoise] = {
@@ -124,21 +130,34 @@ def checked_samples(samples: object) -> InertialSamples:
         The same object.
 
     Raises:
-        DvoError: another type, times that do not increase, or values that are not finite.
+        DvoError: another type, times that do not increase, values that are not finite or out of bounds, or no pose.
     """
     if not isinstance(samples, InertialSamples):
         raise DvoError(
             f"expected InertialSamples, got {type(samples).__name__}", field="inertial",
             remedy="give dvo.data.inertial.InertialSamples(timestamps, gyro, accel, T_camera_imu), or None",
         )  # fmt: skip
-    finite = all(np.isfinite(part).all() for part in (samples.timestamps, samples.gyro, samples.accel))
     pose = samples.T_camera_imu
     if pose is not None and not (np.isfinite(pose).all() and abs(np.linalg.norm(pose[3:]) - 1) < 0.01):
         remedy = "give metres and a unit quaternion"
         raise DvoError(f"{pose} is not a pose", field="inertial: T_camera_imu", remedy=remedy)
-    if not finite or not (np.diff(samples.timestamps) > 0).all():
-        remedy = "give finite values in order of time"
-        raise DvoError("times do not increase, or values are not finite", field="inertial", remedy=remedy)
+    if pose is not None and np.linalg.norm(pose[:3]) > LONGEST_ARM:
+        message = f"the sensor is {np.linalg.norm(pose[:3]):.4g} m from the camera"
+        raise DvoError(message, field="inertial: T_camera_imu", remedy="give metres")
+    for name in ("timestamps", "gyro", "accel") if len(samples) else ():
+        rows = getattr(samples, name).reshape(len(samples), -1)
+        wrong = ~(np.abs(rows) <= MAX_NUMBER).all(axis=1)  # also nan
+        if wrong.any():
+            at = int(wrong.argmax())
+            message = f"is {rows[at].tolist()} at sample {at}: values are not finite, or no measurements"
+            raise DvoError(message, field=f"inertial: {name}", remedy="leave out such samples")
+    back = np.diff(samples.timestamps) <= 0
+    if back.any():
+        at = int(back.argmax())
+        pair = " and ".join(f"{time:.6f}" for time in samples.timestamps[at : at + 2])
+        message = f"times do not increase: {pair} s at samples {at} and {at + 1}"
+        remedy = "sort samples by time, and leave out repeated ones"
+        raise DvoError(message, field="inertial: timestamps", remedy=remedy)
     return samples
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
+
+import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.data.files.files import exists, is_file
@@ -14,7 +16,14 @@ from dvo.data.inertial import NOISE_PRESETS, InertialSamples
 from dvo.data.inertial_files.gopro import read_gopro
 from dvo.data.inertial_files.gpmf import has_telemetry
 from dvo.data.inertial_files.imu_calibration import ImuCalibration, read_imu_calibration, read_noise
-from dvo.data.inertial_files.tables import is_inertial_table, read_inertial_table
+from dvo.data.inertial_files.tables import (
+    RATES,
+    TURN_RATIO,
+    is_inertial_table,
+    read_inertial_table,
+    turn_of_gravity,
+)
+from dvo.data.inertial_files.tidy import GRAVITY_RANGE
 from dvo.data.opening import locate
 from dvo.data.readers import rosbag
 from dvo.data.recording import Recording, Request
@@ -22,6 +31,8 @@ from dvo.data.recording import Recording, Request
 AUTO, NONE = "auto", "none"
 """Values of ``imu`` that are no files: the samples of the recording, and none."""
 
+_COVERED = 0.9  # share of the time of the frames below which a note tells
+_CONSTANT = 20  # samples that should differ
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv")
 _NAMES = ("gyro_accel.csv", "imu.csv", "data.jsonl", "Gyroscope.csv")  # of MARS logger, Stray Scanner, Spectacular AI
 
@@ -33,9 +44,9 @@ class InertialInput:
     Attributes:
         read: reads the samples at times of the inertial sensor; with ``rough``, as they stand.
         calibration: to be applied to them.
-        span: seconds of the first and the last frame, which the samples must meet; None of an end that is not known;
-            None for no check.
-        file: for messages.
+        span: seconds of the first and the last frame; None of an end that is not known; None without frames.
+        file: that the user or a name has brought to the recording, and whose samples must meet the frames; None for
+            samples of the recording itself.
     """
 
     read: Callable[..., InertialSamples]
@@ -51,9 +62,10 @@ class InertialInput:
             DvoError: damaged samples, or times that do not meet those of the frames.
         """
         samples = self.calibration.applied(self.read())
-        if self.span is not None:
+        if self.span is not None and self.file is not None and len(samples):
             check_overlap(samples, self.span, self.file)
-        return samples
+        told = _turns(samples) if self.file is None else []
+        return replace(samples, notes=(*samples.notes, *_remarks(samples, self.span), *told))
 
     def rough(self) -> InertialSamples:
         """The samples as they stand, for a check: neither sorted nor refused for their times or units.
@@ -128,7 +140,7 @@ def inertial_inputs(recording: Recording, imu: Path | str, request: Request, fir
         file = locate(imu, path, "imu")
         read = partial(read_inertial_file, file, request.imu_topic, recording.turned)
         return [InertialInput(read, calibration, span, file)]
-    own = [] if recording.inertial is None else [InertialInput(recording.inertial, calibration)]
+    own = [] if recording.inertial is None else [InertialInput(recording.inertial, calibration, span)]
     return own + [
         InertialInput(partial(read_inertial_file, file, None, recording.turned), calibration, span, file)
         for file in beside(path, recording)
@@ -162,6 +174,39 @@ def check_overlap(samples: InertialSamples, span: tuple[float, float | None], fi
             f"inertial samples from {start:.6f} to {end:.6f} s do not meet the frames {frames}", file=file, field="imu",
             remedy="give times of the frames on the clock of the samples with --times, or time_offset in --imu-calib",
         )  # fmt: skip
+
+
+def _remarks(samples: InertialSamples, span: tuple[float, float | None] | None) -> list[str]:
+    """Sentences about samples that are read as they stand, and of little use."""
+    if not len(samples):
+        return ["there are no inertial samples in it"]
+    start, end, notes = float(samples.timestamps[0]), float(samples.timestamps[-1]), list[str]()
+    if span is not None and span[1] is not None and span[1] > span[0]:
+        covered = max(min(end, span[1]) - max(start, span[0]), 0.0) / (span[1] - span[0])
+        if covered < _COVERED:
+            whole = f"{100 * covered:.0f} % of the frames from {span[0]:.3f} to {span[1]:.3f} s"
+            notes.append(f"inertial samples from {start:.3f} to {end:.3f} s cover {whole}")
+    if len(samples) <= _CONSTANT:
+        return notes
+    for name, rows in (("gyroscope", samples.gyro), ("accelerometer", samples.accel)):
+        if (rows == rows[0]).all():
+            values = ", ".join(f"{value:.4g}" for value in rows[0])
+            notes.append(f"the {name} is {values} in all samples: check that it is on, and its columns")
+    force = float(np.median(np.linalg.norm(samples.accel, axis=1)))
+    if not RATES[0] <= samples.rate <= RATES[1]:
+        usual = f"{RATES[0]:g} to {RATES[1]:g}"
+        notes.append(f"{samples.rate:.4g} inertial samples a second, not {usual}: see dvo imu check")
+    if not GRAVITY_RANGE[0] <= force <= GRAVITY_RANGE[1]:
+        notes.append(f"the median of the accelerometer is {force:.4g} m/s^2, not about 9.81: see dvo imu check")
+    return notes
+
+
+def _turns(samples: InertialSamples) -> list[str]:
+    """Sentence about a gyroscope in another unit than the format has, as readers of tables tell it."""
+    ratio = turn_of_gravity(samples.timestamps, samples.gyro, samples.timestamps, samples.accel)
+    if ratio is None or TURN_RATIO[0] <= ratio <= TURN_RATIO[1]:
+        return []
+    return [f"gravity turns {ratio:.3g} times as fast as the gyroscope says: see dvo imu check"]
 
 
 def imu_calibration_of(

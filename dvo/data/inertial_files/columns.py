@@ -36,8 +36,14 @@ _OTHER = re.compile(
     r"angular ?acc|incr"
 )
 _UNCORRECTED = re.compile(r"unc|unfilt|raw")
+_SUFFIX = re.compile(  # units behind the axis
+    r"(.*[xyz])[ _]((?:m?deg|m?d|rad)(?:[ _]?p?s|[ _]per[ _]s(?:ec)?)|m[ _]?p?s[ _]?(?:\^?2|s)|m?g)$", re.IGNORECASE
+)
+_SPELLED = {"rads": "rad/s", "degs": "deg/s", "ds": "deg/s", "mdegs": "mdps", "mds": "mdps", "ms2": "m/s^2",
+            "mss": "m/s^2", "g": "g", "mg": "mg"}  # fmt: skip
 _INSTANCES = {"i", "instance", "imu", "imu_id", "device_id", "deviceid"}
 _STAMP = re.compile(r"(?:^|[._ ])header[._ ]stamp$")
+_DISTINCT = 0.2  # share of times that are new, of a clock that is fine enough
 _NANOS = re.compile(r"(.*?)(?:n|nano)(secs?)$")
 
 
@@ -69,13 +75,14 @@ def columns_of(header: Sequence[str], path: Path) -> dict[str, Columns]:
     Raises:
         DvoError: a unit that is not known.
     """
+    header = [_bracketed(name) for name in header]
     plain = [_plain(name) for name in header]
     is_ros = any("angular velocity" in name for name in plain)
     groups: dict[str, dict[str, dict[str, int]]] = {}
     for place, name in enumerate(plain):
         for sensor, pattern in (("g-force", _G_FORCE), ("accel", _ACCEL), ("gyro", _GYRO)):
             match = pattern.fullmatch(name)
-            without = sensor == "accel" and _WITHOUT_GRAVITY.search(name) and not (is_ros and _ROS.search(name))
+            without = sensor == "accel" and _is_without(name, is_ros)
             if match and not _OTHER.search(name) and not without:
                 stem = name[:-1].strip()
                 while match[1] in groups.get(sensor, {}).get(stem, {}):
@@ -101,6 +108,50 @@ def columns_of(header: Sequence[str], path: Path) -> dict[str, Columns]:
             unit = STANDARD_GRAVITY if sensor == "accel" and is_g else None
             found[sensor] = Columns(places, unit or _stated([header[k] for k in places], sensor, path), rivals)
     return found
+
+
+def without_gravity(header: Sequence[str]) -> list[str]:
+    """Names of columns of an accelerometer from which gravity was removed.
+
+    Args:
+        header: names of the columns.
+    """
+    plain = [_plain(_bracketed(name)) for name in header]
+    is_ros = any("angular velocity" in name for name in plain)
+    pairs = zip(header, plain, strict=True)
+    return [name for name, words in pairs if _ACCEL.fullmatch(words) and _is_without(words, is_ros)]
+
+
+def _is_without(name: str, is_ros: bool) -> bool:
+    return bool(_WITHOUT_GRAVITY.search(name)) and not (is_ros and _ROS.search(name))
+
+
+def with_units(header: Sequence[str], units: Sequence[str]) -> list[str]:
+    """Names of columns with units that stand in a line of their own.
+
+    Args:
+        header: names of the columns.
+        units: what stands below them.
+
+    Returns:
+        Empty if these are no units.
+    """
+    plain = [cell.strip().strip("[]()").strip() for cell in units]
+    known = {name.replace(" ", "") for name in (*FORCE_UNITS, *RATE_UNITS)}
+    count = sum(cell.lower().replace(" ", "") in known for cell in plain)
+    if count < 3 or len(units) != len(header):  # of one sensor
+        return []
+    return [f"{name} [{unit}]" if unit and not _UNIT.search(name) else name
+            for name, unit in zip(header, plain, strict=True)]  # fmt: skip
+
+
+def _bracketed(name: str) -> str:
+    """Name whose unit stands in brackets: ``acc_x [m/s^2]`` of ``acc_x_m_s2``."""
+    found = None if _UNIT.search(name) else _SUFFIX.fullmatch(name.strip())
+    if found is None:
+        return name
+    short = re.sub(r"[ _^]|p(?=s)|per|(?<=s)ec$", "", found[2].lower())
+    return f"{found[1]} [{_SPELLED[short]}]" if short in _SPELLED else name
 
 
 def _plain(name: str) -> str:
@@ -132,11 +183,11 @@ def _stated(names: Sequence[str], sensor: str, path: Path) -> float | None:
 
 def time_columns(
     header: Sequence[str], rows: Sequence[Sequence[str]], sensors: Mapping[str, Columns]
-) -> dict[str, int | tuple[int, int]]:
+) -> tuple[dict[str, int | tuple[int, int]], str]:
     """Column of the times of each sensor.
 
-    It is the stamp of a ROS header, or else the first that is named a time and holds numbers; of several with this name
-    (phyphox) the nearest one to the left of the sensor.
+    It is the stamp of a ROS header, or else the first that is named a time and holds numbers, which do not repeat where
+    there is another one; of several with this name (phyphox) the nearest one to the left of the sensor.
 
     Args:
         header: names of the columns.
@@ -144,7 +195,7 @@ def time_columns(
         sensors: their columns.
 
     Returns:
-        For each sensor a column, or those of seconds and nanoseconds, which add up; empty if there is none.
+        For each sensor a column, or those of seconds and nanoseconds, which add up; empty if there is none. And a note.
     """
     others = {place for columns in sensors.values() for place in columns.places}
     names = {k: _UNIT.sub("", name) for k, name in enumerate(header) if k not in others}  # m/s is no time
@@ -156,13 +207,23 @@ def time_columns(
             pairs += [(j, k) for j, other in low.items() if other == parts[1] + parts[2]]
     stamp = next((k for k, name in low.items() if _STAMP.search(name) and _are_numbers(rows, k)), None)
     if stamp is None and pairs:
-        return dict.fromkeys(sensors, pairs[0])
+        return dict.fromkeys(sensors, pairs[0]), ""
     named = [k for k, name in names.items() if is_time_name(name) or "time" in low[k]]
     if stamp is None and not named:
-        return {}
-    first = stamp if stamp is not None else next((k for k in named if _are_numbers(rows, k)), named[0])
+        return {}, ""
+    numbers = [k for k in named if _are_numbers(rows, k)] or named[:1]
+    first = stamp if stamp is not None else next((k for k in numbers if _changes(rows, k)), numbers[0])
     same = [k for k in named if low[k] == low[first]] or [first]
-    return {name: max((k for k in same if k < min(columns.places)), default=first) for name, columns in sensors.items()}
+    passed = stamp is None and first != numbers[0]
+    note = f"most rows of {header[numbers[0]]} are the same: times are those of {header[first]}" if passed else ""
+    places = {name: max((k for k in same if k < min(one.places)), default=first) for name, one in sensors.items()}
+    return dict(places), note
+
+
+def _changes(rows: Sequence[Sequence[str]], column: int) -> bool:
+    """True if the cells do not repeat more often than those of several sensors at one time."""
+    cells = [row[column] for row in rows[:1000] if row[column]]
+    return len(set(cells)) > _DISTINCT * len(cells)
 
 
 def _are_numbers(rows: Sequence[Sequence[str]], column: int) -> bool:

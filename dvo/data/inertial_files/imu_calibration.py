@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from dvo.core.yaml_files import read_text
 from dvo.data.calibration.documents import load_yaml
 from dvo.data.extrinsics import pose_of_numbers
 from dvo.data.files.files import is_file
-from dvo.data.inertial import NOISE_PRESETS, ImuNoise, InertialSamples
+from dvo.data.inertial import LEAST_NOISE, LONGEST_ARM, NOISE_PRESETS, ImuNoise, InertialSamples
 from dvo.geometry.poses import compose_poses, invert_poses
 
 NOISE_FACTOR = 1.0
@@ -38,7 +38,6 @@ _DENSITIES = {
 }
 """Names of Kalibr and of EuRoC's ``sensor.yaml``; units rad/s/sqrt(Hz), rad/s^2/sqrt(Hz), m/s^2/sqrt(Hz) and
 m/s^3/sqrt(Hz)."""
-_LONGEST_ARM = 10.0  # metres: numbers above it are millimetres
 _LARGEST = 1e30  # of a number
 _OWN = {field.name for field in fields(ImuNoise)}
 _OTHER = re.compile(  # entries of the same files that say nothing of the inertial sensor
@@ -126,7 +125,7 @@ def _read(given: str) -> ImuCalibration:
     entries = _Entries(_flat(data, camera, path), path)
     found = _of_entries(entries)
     entries.check_used()
-    if found.T_camera_imu is not None and np.linalg.norm(found.T_camera_imu[:3]) > _LONGEST_ARM:
+    if found.T_camera_imu is not None and np.linalg.norm(found.T_camera_imu[:3]) > LONGEST_ARM:
         message = f"the sensor is {np.linalg.norm(found.T_camera_imu[:3]):.4g} m from the camera"
         raise DvoError(message, file=path, field="T_camera_imu", remedy="give metres")
     if found.noise is None and found.T_camera_imu is None and found.time_offset is None:
@@ -224,7 +223,7 @@ def _number(value: Any, name: str, low: float, path: Path) -> float:
             value = float(value)
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LARGEST
     if not is_number or value < low:
-        what = "a number" if low == -math.inf else f"a number of at least {low:g}"
+        what = "a number" if low == -math.inf else f"a number above 0, at least {low:g}"
         raise DvoError(f"is {str(value)[:60]}", file=path, field=name, remedy=f"give {what}")
     return float(value)
 
@@ -236,7 +235,8 @@ def _of_entries(entries: _Entries) -> ImuCalibration:
         remedy = "state noise or preset too"
         raise DvoError("there is no noise that it multiplies", file=entries.path, field="noise_factor", remedy=remedy)
     if noise is not None:
-        noise = scaled(noise, NOISE_FACTOR if factor is None else factor)
+        stated, times = noise, NOISE_FACTOR if factor is None else factor
+        noise = _in_file(entries.path, lambda: scaled(stated, times))
     offset = entries.take("time_offset", "timeshift_cam_imu")
     if offset is not None:
         name = "time_offset" if "time_offset" in entries.values else "timeshift_cam_imu"
@@ -270,12 +270,12 @@ def _extrinsics(entries: _Entries) -> np.ndarray | None:
 def _noise(entries: _Entries) -> ImuNoise | None:
     stated: dict[str, float] = {}
     for name, own in _DENSITIES.items():
-        value = entries.number(name, 0.0)
+        value = entries.number(name, LEAST_NOISE)
         if value is not None:
             stated[own] = value
     table = entries.take("noise")
     for name, value in _table(table, entries.path):
-        stated[name] = _number(value, f"noise.{name}", 0.0, entries.path)
+        stated[name] = _number(value, f"noise.{name}", LEAST_NOISE, entries.path)
     preset = entries.take("preset")
     if preset is not None and (not isinstance(preset, str) or preset not in NOISE_PRESETS):
         remedy = f"give one of {', '.join(NOISE_PRESETS)}"
@@ -286,10 +286,17 @@ def _noise(entries: _Entries) -> ImuNoise | None:
     if preset is None and missing:
         remedy = "state all four densities, or a preset for the others"
         raise DvoError(f"{', '.join(missing)} of the noise is missing", file=entries.path, field="noise", remedy=remedy)
-    if any(stated.get(name) == 0 for name in ("gyro", "accel")):
-        raise DvoError("a sensor without noise", file=entries.path, field="noise", remedy="give densities above 0")
     base = NOISE_PRESETS[preset] if preset is not None else NOISE_PRESETS["phone"]  # initial biases are rarely stated
-    return replace(base, **stated)
+    return _in_file(entries.path, lambda: replace(base, **stated))
+
+
+def _in_file(path: Path, made: Callable[[], ImuNoise]) -> ImuNoise:
+    """The noise, or an error that names the file."""
+    try:
+        return made()
+    except DvoError as error:
+        field = str(error.field).removeprefix("inertial: ")
+        raise DvoError(error.message, file=path, field=field, remedy=error.remedy) from None
 
 
 def _table(table: Any, path: Path) -> Iterator[tuple[str, Any]]:

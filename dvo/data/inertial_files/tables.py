@@ -9,6 +9,7 @@ norm is that of gravity; one of the gyroscope the one in which gravity turns in 
 from __future__ import annotations
 
 import contextlib
+import csv
 import json
 import math
 import re
@@ -19,14 +20,27 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.clock import NAMES, PARTS, is_number, parse_time, unit_of_name
-from dvo.data.files.files import is_file, read_lines
+from dvo.data.files.clock import NAMES, PARTS, is_number, parse_time, unit_of_dates, unit_of_name
+from dvo.data.files.files import MAX_NUMBER, is_file, read_lines
 from dvo.data.inertial import InertialSamples
-from dvo.data.inertial_files.columns import NAMED, RATE_UNITS, Columns, columns_of, first_instance, time_columns
+from dvo.data.inertial_files.columns import (
+    NAMED,
+    RATE_UNITS,
+    Columns,
+    columns_of,
+    first_instance,
+    time_columns,
+    with_units,
+    without_gravity,
+)
 from dvo.data.inertial_files.tidy import GRAVITY_RANGE, STANDARD_GRAVITY, check_gravity, joined, tidy
 
 RATES = (15.0, 5000.0)
 """Samples a second of an inertial sensor; the units of time differ by more than the ratio."""
+SLOW = 1.0
+"""Samples a second from which slower ones are those of a logger, and not of another unit."""
+TURN_RATIO = (0.13, 7.5)
+"""Turn of gravity over that of the gyroscope: half way to another unit."""
 REMEDY = (
     "give a table whose header names time, gyroscope and accelerometer with their units, such as "
     "'time [ns], gx [rad/s], gy [rad/s], gz [rad/s], ax [m/s^2], ay [m/s^2], az [m/s^2]'"
@@ -36,9 +50,13 @@ _APPLE = re.compile(r"alpha_[xyz]$|accelerometerAcceleration[XYZ]")  # Stray Sca
 _PARTNERS = ("TotalAcceleration", "AccelerometerUncalibrated", "Accelerometer")  # of Sensor Logger, in this order
 _XSENS = {"0.1 ms": 10**4, "us": 10**6}  # units of SampleTimeFine, of MT and of DOT
 _SMOOTH = 0.2  # seconds over which gravity is averaged where it is compared with the gyroscope
-_TURN_RATIO = (0.13, 7.5)  # of the turn of gravity to that of the gyroscope: half way to another unit
 _TELLS = 0.3  # share of the change of gravity that the gyroscope explains
 _FASTEST = 20.0  # rad/s: numbers of the gyroscope that exceed it are degrees
+_PREAMBLE = 100  # lines among which the header is
+_FEWEST_NUMBERS = 3  # in the first row of samples
+_BRIEF = 2.0  # seconds: a recording that would be shorter is rather one of a slower logger in another unit
+_REPEATS = 0.3  # share of repeated times that is told beside a wrong rate
+_NO_GRAVITY = "record the accelerometer with gravity (TotalAcceleration, Accelerometer), not the linear acceleration"
 
 
 @dataclass(frozen=True)
@@ -47,13 +65,16 @@ class _Sensor:
 
     Attributes:
         times: ``(K,)`` seconds.
-        values: ``(K, 3)`` in the unit of the file.
+        values: ``(K, 3)`` in the unit of the file; NaN for what is not finite or out of bounds.
         factor: of the stated unit to the standard one; None for none.
     """
 
     times: np.ndarray
     values: np.ndarray
     factor: float | None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", np.where(np.abs(self.values) <= MAX_NUMBER, self.values, np.nan))
 
 
 @dataclass(frozen=True)
@@ -91,11 +112,11 @@ def read_inertial_table(path: Path, *, rough: bool = False) -> InertialSamples:
         sensors, notes = _json_lines(path), list[str]()
         where = path.name
     else:
-        sensors, notes = _of_text(path)
+        sensors, notes = _of_text(path, rough)
         where = path.name
         if len(sensors) == 1:
             partner = _partner(path, next(iter(sensors)))
-            others, more = _of_text(partner)
+            others, more = _of_text(partner, rough)
             where, notes = f"{path.name} and {partner.name}", [*notes, *more]
             sensors |= {name: sensor for name, sensor in others.items() if name not in sensors}
     for name in ("gyro", "accel"):
@@ -157,8 +178,17 @@ def _partner(path: Path, sensor: str) -> Path:
     if len(found) != 1:
         what = "several files" if found else "no file"
         message = f"only the {_noun(sensor)} in it, and {what} of the {_noun(other)} beside it"
+        linear = [] if found or other != "accel" else [*without_gravity(_text(path).header)[:1], *_linear(there)]
+        if linear:
+            message = f"gravity was removed from {linear[0]}, and there is no other accelerometer"
+            raise DvoError(message, file=path, field=other, remedy=_NO_GRAVITY)
         raise DvoError(message, file=path, field=other, remedy=REMEDY)
     return found[0]
+
+
+def _linear(files: Sequence[Path]) -> list[str]:
+    """Names of files of an accelerometer without gravity."""
+    return [file.name for file in files if re.search(r"(lin|user).*acc", file.stem, re.IGNORECASE)]
 
 
 def _text(path: Path) -> _Text:
@@ -174,18 +204,30 @@ def _text(path: Path) -> _Text:
     mark = next((mark for mark in ("\t", ";", ",") if mark in rows[-1]), None)
 
     def cells(line: str) -> list[str]:
+        if mark and '"' in line:  # a mark within quotes is none
+            return [cell.strip() for cell in next(csv.reader([line], delimiter=mark, skipinitialspace=True))]
         return [cell.strip().strip('"') for cell in (line.split(mark) if mark else line.split())]
 
+    def names(line: str) -> list[str]:
+        if mark and mark in line:
+            return cells(line)
+        return [cell for cell in re.split(r"[,;\t]\s*|\s{2,}|\s(?![\[(])", line) if cell]
+
     header: list[str] = []
-    if not any(is_number(cell.replace(",", ".")) for cell in cells(rows[0])):
-        header, rows = cells(rows[0]), rows[1:]
-    elif comments:
-        named = comments[-1]
-        header = cells(named) if mark and mark in named else [cell for cell in re.split(r"[,;\t]\s*|\s{2,}|\s(?![\[(])",
-                                                                                        named) if cell]  # fmt: skip
     notes: list[str] = []
+    above = _header_lines([cells(row) for row in rows[:_PREAMBLE]])
+    if above:
+        header = names(rows[above[0]])
+        if len(above) > 1:  # units have a line of their own
+            header = with_units(header, cells(rows[above[1]]))
+        if above[0]:
+            notes.append(f"{path.name}: {above[0]} line{'s' * (above[0] > 1)} above the header not read")
+        rows = rows[above[-1] + 1 :]
+    elif comments:
+        header = names(comments[-1])
     texts = [cells(row) for row in rows]
-    if header and texts and all(len(row) == len(header) + 1 and not row[-1] for row in texts):
+    if texts and all(len(row) > 1 and not row[-1] and len(row) in (len(header) + 1, len(texts[0])) for row in texts) \
+            and len(texts[0]) != len(header):  # fmt: skip
         texts = [row[:-1] for row in texts]
     width = len(header) or max(map(len, texts), default=0)
     if header and texts and len(header) != max(map(len, texts)):
@@ -198,11 +240,24 @@ def _text(path: Path) -> _Text:
     if texts and len(texts[-1]) != width:  # a recording that was cut off
         texts = texts[:-1]
         notes.append(f"{path.name}: the last row is not whole and was dropped")
-    decimal = mark in (";", "\t") and any("," in cell for row in texts for cell in row)
-    if decimal:
-        texts = [[cell.replace(",", ".") for cell in row] for row in texts]
+    if mark and any("," in cell for row in texts for cell in row):  # decimal commas
+        texts = [[cell if "." in cell else cell.replace(",", ".") for cell in row] for row in texts]
     table = np.array([[_float(cell) for cell in row] for row in texts], dtype=np.float64).reshape(-1, width)
     return _Text(header, table, texts, notes)
+
+
+def _header_lines(rows: Sequence[Sequence[str]]) -> list[int]:
+    """Numbers of the line that names the columns, and of the one behind it that has their units, if there is one; empty
+    if numbers begin at once."""
+    numbers = [sum(is_number(cell.replace(",", ".")) for cell in row) for row in rows]
+    first = next((k for k, count in enumerate(numbers) if count >= _FEWEST_NUMBERS), len(rows))
+    words = [k for k in range(first) if not numbers[k]]
+    if not words:
+        return []
+    last = words[-1]
+    if last - 1 in words and len(rows[last]) == len(rows[last - 1]) and with_units(rows[last - 1], rows[last]):
+        return [last - 1, last]
+    return [last]
 
 
 def _float(cell: str) -> float:
@@ -212,21 +267,23 @@ def _float(cell: str) -> float:
         return math.nan
 
 
-def _of_text(path: Path) -> tuple[dict[str, _Sensor], list[str]]:
+def _of_text(path: Path, rough: bool) -> tuple[dict[str, _Sensor], list[str]]:
     """Sensors in a text file, and notes."""
     text = _text(path)
     if not len(text.table):
         raise DvoError("no rows in it", file=path, field="imu", remedy=REMEDY)
     if not text.header:
-        return _unnamed(text, path)
+        return _unnamed(text, path, rough)
     kept, note = first_instance(text.header, text.rows)
     if kept is not None:
         text = replace(text, table=text.table[kept], rows=[text.rows[k] for k in kept])
         text.notes.append(f"{path.name}: {note}")
     columns = columns_of(text.header, path)
+    if not columns and (linear := without_gravity(text.header)):
+        raise DvoError(f"gravity was removed from {linear[0]}", file=path, field="accel", remedy=_NO_GRAVITY)
     if not columns:
         raise DvoError("no columns of a gyroscope or an accelerometer", file=path, field="header", remedy=REMEDY)
-    clocks, notes = _times(text, columns, path)
+    clocks, notes = _times(text, columns, path, rough)
     found = {name: _Sensor(clocks[name], text.table[:, one.places], one.factor) for name, one in columns.items()}
     for name, one in columns.items():
         if one.rivals:
@@ -247,13 +304,15 @@ def _apart(found: dict[str, _Sensor]) -> dict[str, _Sensor]:
             for name, one in found.items()}  # fmt: skip
 
 
-def _times(text: _Text, columns: dict[str, Columns], path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
+def _times(
+    text: _Text, columns: dict[str, Columns], path: Path, rough: bool
+) -> tuple[dict[str, np.ndarray], list[str]]:
     """Seconds of the rows for each sensor; the same array for those with one column of times."""
-    places = time_columns(text.header, text.rows, columns)
+    places, passed = time_columns(text.header, text.rows, columns)
     if not places:
         raise DvoError("no column of times", file=path, field="time", remedy=REMEDY)
     known: dict[int | tuple[int, int], np.ndarray] = {}
-    notes: list[str] = []
+    notes = [f"{path.name}: {passed}"] if passed else []
     for place in places.values():
         if place in known:
             continue
@@ -262,17 +321,17 @@ def _times(text: _Text, columns: dict[str, Columns], path: Path) -> tuple[dict[s
             whole = np.isfinite(seconds) & np.isfinite(nanos)
             cells = [str(int(s) * PARTS["ns"] + int(n)) if ok else "" for s, n, ok in
                      zip(seconds, nanos, whole, strict=True)]  # fmt: skip
-            known[place], _ = _in_seconds(cells, "ns", path)
+            known[place], _ = _in_seconds(cells, "ns", path, rough=rough)
             continue
         name, cells = text.header[place], [row[place] for row in text.rows]
         units = _XSENS if name.strip().lower() == "sampletimefine" else PARTS
-        known[place], told = _in_seconds(cells, unit_of_name(name), path, units)
+        known[place], told = _in_seconds(cells, unit_of_name(name), path, units, rough=rough)
         notes += told
     return {name: known[place] for name, place in places.items()}, notes
 
 
 def _in_seconds(
-    cells: Sequence[str], unit: str | None, path: Path, units: Mapping[str, int] = PARTS
+    cells: Sequence[str], unit: str | None, path: Path, units: Mapping[str, int] = PARTS, *, rough: bool = False
 ) -> tuple[np.ndarray, list[str]]:
     """Seconds of times as text; a cell that holds no number is NaN."""
     values: list[int | float | None] = []
@@ -285,27 +344,95 @@ def _in_seconds(
     if 2 * len(known) <= len(values):
         message = f"times that are no numbers, such as {cells[0][:40]}"
         raise DvoError(message, file=path, field="time", remedy="give times in seconds to the millisecond, or finer")
-    steps = np.diff(np.array([float(value) for value in known]))
-    steps = steps[steps > 0]
-    if not len(steps):
-        raise DvoError("times that do not increase", file=path, field="time", remedy=REMEDY)
-    step, notes = float(np.median(steps)), []
+    clock = _Clock.of(known, units)
+    notes = []
     if unit is None:
-        unit = next((name for name, parts in units.items() if RATES[0] <= parts / step <= RATES[1]), None)
-        if unit is None:
-            message = f"the unit of the times is not clear: one is {step:.6g} after the other"
-            raise DvoError(message, file=path, field="time", remedy="name it in the header, such as 'time [ns]'")
+        unit = clock.unit(path, rough=rough)
         if unit != "s":
             notes.append(f"{path.name}: times are taken for {NAMES.get(unit, unit)}")
-    if not RATES[0] <= units[unit] / step <= RATES[1]:
-        message = f"{units[unit] / step:.4g} samples a second"
-        remedy = f"give {RATES[0]:g} to {RATES[1]:g} a second, and the unit of the times in the header"
-        raise DvoError(message, file=path, field="time", remedy=remedy)
+    if not rough:
+        clock.check_rate(unit, path)
     parts = units[unit]
     return np.array([math.nan if value is None else value / parts for value in values]), notes
 
 
-def _unnamed(text: _Text, path: Path) -> tuple[dict[str, _Sensor], list[str]]:
+@dataclass(frozen=True)
+class _Clock:
+    """Numbers that are times, in one of several units.
+
+    Attributes:
+        count: of all.
+        order: ``(U,)`` each number once, increasing.
+        units: numbers to a second, by name.
+    """
+
+    count: int
+    order: np.ndarray
+    units: Mapping[str, int]
+
+    @staticmethod
+    def of(values: Sequence[int | float], units: Mapping[str, int]) -> _Clock:
+        return _Clock(len(values), np.unique(np.array([float(value) for value in values])), units)
+
+    def rates(self) -> dict[str, float]:
+        """Numbers a second by the median of the intervals, for each unit; infinite if all are one."""
+        steps = np.diff(self.order)
+        step = float(np.median(steps)) if len(steps) else 0.0
+        return {name: parts / step if step > 0 else math.inf for name, parts in self.units.items()}
+
+    def unit(self, path: Path, *, rough: bool) -> str:
+        """Unit in which the samples come at the rate of an inertial sensor.
+
+        Another one, in which they are as slow as some loggers, must not be as likely: in it they are dates, or in the
+        first one the recording would be over at once.
+        """
+        rates = self.rates()
+        dates = unit_of_dates(self.order) if self.units is PARTS else None
+        fit = next((name for name, rate in rates.items() if RATES[0] <= rate <= RATES[1]), None)
+        slow = next((name for name, rate in rates.items() if SLOW <= rate < RATES[0]), None)
+        is_brief = fit is not None and self.order[-1] - self.order[0] < _BRIEF * self.units[fit]
+        if fit is not None and (slow is None or (slow != dates and not is_brief)):
+            return fit
+        if rough:
+            return slow or dates or next(iter(self.units))
+        if slow is None:
+            if len(self.order) < 2:
+                self.check_rate("s", path)
+            step = float(np.median(np.diff(self.order)))
+            message = f"the unit of the times is not clear: one is {step:.6g} after the other"
+            raise DvoError(message, file=path, field="time", remedy="name it in the header, such as 'time [ns]'")
+        message = f"{rates[slow]:.4g} samples a second, if the unit of the times is {slow}"
+        remedy = f"record at 100 to 400 a second, or name the unit in the header, such as 'time [{slow}]'"
+        if fit is not None:
+            both = f"{rates[slow]:.4g} samples a second in {slow}, {rates[fit]:.4g} in {fit}"
+            message = f"the unit of the times is not clear: {both}"
+            remedy = f"name it in the header, such as 'time [{fit}]'"
+        raise DvoError(message, file=path, field="time", remedy=remedy)
+
+    def check_rate(self, unit: str, path: Path) -> None:
+        """Refuse times that are not those of an inertial sensor."""
+        if self.count > 1 and len(self.order) < 2:
+            message = f"times that do not increase: all {self.count} are {self.order[0]:.10g}"
+            raise DvoError(message, file=path, field="time", remedy="write them with more digits")
+        if len(self.order) < 2:
+            raise DvoError(f"{self.count} sample", file=path, field="time", remedy="record for longer")
+        rate = self.rates()[unit]
+        if RATES[0] <= rate <= RATES[1]:
+            return
+        message = f"{rate:.4g} samples a second"
+        remedy = f"give {RATES[0]:g} to {RATES[1]:g} a second, and the unit of the times in the header"
+        mean = self.units[unit] * (len(self.order) - 1) / float(self.order[-1] - self.order[0])
+        repeated = 1 - len(self.order) / self.count
+        if rate > RATES[1] and RATES[0] <= mean <= RATES[1]:
+            message = f"samples come in bursts: {mean:.4g} a second, but most are {1 / rate:.2g} s after the one before"
+            remedy = "write the stamps of the sensor, not those of arrival"
+        elif repeated > _REPEATS:
+            message += f": {100 * repeated:.0f} % of the rows have the time of another one"
+            remedy = "write times of the sensor, with more digits"
+        raise DvoError(message, file=path, field="time", remedy=remedy)
+
+
+def _unnamed(text: _Text, path: Path, rough: bool) -> tuple[dict[str, _Sensor], list[str]]:
     """Sensors of a file without a header: time and six numbers, the three with gravity in it being the accelerometer;
     or time and three numbers, the time first or last, in a file whose name tells the sensor."""
     width = text.table.shape[1]
@@ -315,7 +442,7 @@ def _unnamed(text: _Text, path: Path) -> tuple[dict[str, _Sensor], list[str]]:
     if len(increasing) != 1 or not (width == 7 or (width == 4 and sensor)):
         message = f"{width} columns without a header, which do not tell what they are"
         raise DvoError(message, file=path, field="header", remedy=REMEDY)
-    times, notes = _in_seconds([row[increasing[0]] for row in text.rows], None, path)
+    times, notes = _in_seconds([row[increasing[0]] for row in text.rows], None, path, rough=rough)
     rest = [k for k in range(width) if k != increasing[0]]
     if width == 4:
         return {str(sensor): _Sensor(times, text.table[:, rest], None)}, [*text.notes, *notes]
@@ -352,7 +479,7 @@ def _rate_unit(gyro: _Sensor, accel: _Sensor, path: Path) -> tuple[float, list[s
     """Factor to rad/s, and a note if it is a guess, or if gravity turns otherwise."""
     ratio = turn_of_gravity(gyro.times, gyro.values, accel.times, accel.values)
     if gyro.factor is not None:
-        if ratio is None or _TURN_RATIO[0] <= ratio / gyro.factor <= _TURN_RATIO[1]:
+        if ratio is None or TURN_RATIO[0] <= ratio / gyro.factor <= TURN_RATIO[1]:
             return gyro.factor, []
         note = f"the stated unit of the gyroscope does not fit: gravity turns {ratio / gyro.factor:.3g} times as fast"
         return gyro.factor, [f"{path.name}: {note}; see dvo imu check"]
@@ -360,7 +487,7 @@ def _rate_unit(gyro: _Sensor, accel: _Sensor, path: Path) -> tuple[float, list[s
     if ratio is not None:
         name = "rad/s" if ratio > 0.13 else "deg/s"  # half way between 1 and pi / 180
         reason = "as gravity turns"
-        if not _TURN_RATIO[0] <= ratio / RATE_UNITS[name] <= _TURN_RATIO[1]:
+        if not TURN_RATIO[0] <= ratio / RATE_UNITS[name] <= TURN_RATIO[1]:
             message = f"the gyroscope is neither in rad/s nor in deg/s: gravity turns {ratio:.3g} times as fast"
             remedy = "name its unit in the header, such as 'gx [rad/s]'; counts of the sensor are none"
             raise DvoError(message, file=path, field="gyro", remedy=remedy)
@@ -384,15 +511,14 @@ def turn_of_gravity(
     Returns:
         1 for rad/s; None where too little of the one is explained by the other.
     """
-    a_times, keep = np.unique(accel_times[np.isfinite(accel_times)], return_index=True)
-    a = accel[np.isfinite(accel_times)][keep]
-    w_times, keep = np.unique(gyro_times[np.isfinite(gyro_times)], return_index=True)
-    w = gyro[np.isfinite(gyro_times)][keep]
+    (a_times, a), (w_times, w) = _ordered(accel_times, accel), _ordered(gyro_times, gyro)
+    if not len(a_times) or not len(w_times):
+        return None
     start, end = max(a_times[0], w_times[0]), min(a_times[-1], w_times[-1])
     if not 10 * _SMOOTH <= end - start <= _SMOOTH * len(w_times):  # too short, or gaps alone
         return None
     edges = np.arange(start, end, _SMOOTH)
-    means = [np.stack([_means(times, np.nan_to_num(values[:, k]), edges) for k in range(3)], axis=1)
+    means = [np.stack([_means(times, values[:, k], edges) for k in range(3)], axis=1)
              for times, values in ((a_times, a), (w_times, w))]  # fmt: skip
     forces, rates = means
     change = (forces[2:] - forces[:-2]) / (2 * _SMOOTH)
@@ -403,6 +529,13 @@ def turn_of_gravity(
     ratio = float((change * model).sum()) / power
     explained = ratio**2 * power / max(float((change**2).sum()), 1e-12)
     return ratio if ratio > 0 and explained > _TELLS else None
+
+
+def _ordered(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of finite numbers in order of time, the first of each time."""
+    whole = np.isfinite(times) & (np.abs(values) <= MAX_NUMBER).all(axis=1)
+    found, keep = np.unique(times[whole], return_index=True)
+    return found, values[whole][keep]
 
 
 def _means(times: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -15,6 +15,8 @@ STANDARD_GRAVITY = 9.80665
 GRAVITY_RANGE = (6.0, 14.0)
 """Median of the specific force that a recording on Earth has, m/s^2."""
 
+_ANOTHER_CLOCK = 1e7  # seconds from one sample to the next that are no pause
+_COARSE = 0.5  # share of samples that may have the time of another one
 _SET_BACK = 1.0  # seconds: rows that are later than others by more do not stand in the order of one recording
 _FEWEST = 2
 
@@ -54,10 +56,17 @@ def tidy(
         order = np.argsort(times, kind="stable")
         notes.append(f"{origin}: {_rows(late > 0)} out of order sorted by time")
         times, gyro, accel = times[order], gyro[order], accel[order]
-    same = np.append(False, np.diff(times) <= 0)
+    same = np.append(False, np.diff(times) <= 0) if len(times) else np.zeros(0, bool)
+    again = (gyro[1:] == gyro[:-1]).all(axis=1) & (accel[1:] == accel[:-1]).all(axis=1)
+    if len(times) > 1 and (same[1:] & ~again).mean() > _COARSE:
+        message = f"{int(same.sum())} of {len(times)} samples have the time of another one"
+        raise DvoError(message, file=file, field="times", remedy="write times of the sensor, with more digits")
     if same.any():
         notes.append(f"{origin}: {_rows(same)} with the time of the one before dropped")
         times, gyro, accel = times[~same], gyro[~same], accel[~same]
+    if len(times) > 1 and (longest := float(np.diff(times).max())) > _ANOTHER_CLOCK:
+        message = f"the clock is set forward by {longest:.6g} s at sample {int(np.diff(times).argmax()) + 1}"
+        raise DvoError(message, file=file, field="times", remedy="split the file where another clock begins")
     if len(times) < _FEWEST:
         message = f"{len(times)} inertial sample{'s' * (len(times) != 1)}"
         raise DvoError(message, file=file, field="times", remedy="give a recording of gyroscope and accelerometer")
@@ -95,7 +104,7 @@ def joined(
         DvoError: sensors that did not record at the same time, or see :func:`tidy`.
     """
     if rough:
-        order = np.argsort(accel_times, kind="stable")
+        order = np.argsort(accel_times, kind="stable")[: np.isfinite(accel_times).sum()]  # NaN are last
         forces = np.stack([np.interp(gyro_times, accel_times[order], accel[order, k]) for k in range(3)], axis=1)
         return tidy(gyro_times, gyro, forces, file, origin, rough=True)
     w = tidy(gyro_times, gyro, np.zeros_like(gyro), file, f"{origin}, gyroscope")

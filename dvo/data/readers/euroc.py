@@ -8,6 +8,7 @@ TUM-VI has the same layout with Kalibr's ``T_cam_imu``, the inverse, in ``dso/ca
 
 from __future__ import annotations
 
+import math
 import re
 from array import array
 from functools import partial
@@ -45,6 +46,8 @@ from dvo.data.trajectory import Trajectory, interpolate, unit_quaternions
 from dvo.geometry.poses import compose_poses, invert_poses
 
 _CAMERA = re.compile(r"cam[0-9]+")
+_WHOLE = 0.9  # share of whole numbers among measurements that are parts of decimal numbers
+_LONGEST_STEP = 10.0  # seconds between rows whose times are dates
 
 
 def _place(path: Path) -> tuple[Path, str] | None:
@@ -90,8 +93,9 @@ def _timed_rows(path: Path, columns: int, header: str) -> tuple[np.ndarray, np.n
 
     Dates in another unit than nanoseconds, as some recorders write them, become nanoseconds.
     """
-    times, values, lines = array("q"), array("d"), array("q")
+    times, values, lines, width = array("q"), array("d"), array("q"), 0
     for number, fields in read_rows(path, "use EuRoC's data.csv"):
+        width = max(width, len(fields) - 1)
         try:
             time, row = parse_nanoseconds(fields[0]), [parse_number(field) for field in fields[1 : columns + 1]]
         except ValueError:
@@ -104,7 +108,17 @@ def _timed_rows(path: Path, columns: int, header: str) -> tuple[np.ndarray, np.n
         values.extend(row)
         lines.append(number)
     table, numbers = np.array(values, dtype=np.float64).reshape(-1, columns), np.array(times, dtype=np.int64)
-    return numbers * (PARTS["ns"] // PARTS[unit_of_dates(numbers) or "ns"]), table, lines.tolist()
+    if width > columns and table.any() and (table % 1 == 0).mean() > _WHOLE:
+        message = f"{width} whole numbers behind the time: decimal commas, which part two numbers"
+        raise DvoError(message, file=path, field="rows", remedy=f"write '{header}' with decimal points")
+    return numbers * (PARTS["ns"] // PARTS[_unit(numbers) or "ns"]), table, lines.tolist()
+
+
+def _unit(times: np.ndarray) -> str | None:
+    """Unit in which times are dates; None for other ones, such as the first seconds of a clock in nanoseconds."""
+    unit = unit_of_dates(times)
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    return unit if unit is not None and step <= _LONGEST_STEP * PARTS[unit] else None
 
 
 def read_inertial(path: Path, calibration: ImuCalibration | None = None) -> InertialSamples:
@@ -175,7 +189,7 @@ def _inertial(mav: Path, camera: str, request: Request, *, rough: bool = False) 
     given, offset = request.imu_calibration, None
     if (given is None or given.time_offset is None) and (kalibr := _kalibr_camera(mav, camera)) is not None:
         offset = kalibr[0].get("timeshift_cam_imu")
-        if offset is not None and not isinstance(offset, int | float):
+        if offset is not None and not (isinstance(offset, int | float) and math.isfinite(offset)):
             field = f"{camera}.timeshift_cam_imu"
             raise DvoError("no number", file=kalibr[1], field=field, remedy="give seconds, t_imu - t_cam")
     calibration, table = ImuCalibration(noise, T_camera_imu, offset), mav / "imu0" / "data.csv"
@@ -232,7 +246,7 @@ def _images(camera: Path, warnings: list[str]) -> tuple[list[Path], np.ndarray |
             ) from None
         rows.append((time, listed_file(listing, camera / "data", name, number)))
     rows.sort()
-    unit = unit_of_dates([time for time, _ in rows]) or stated or "ns"
+    unit = _unit(np.array([time for time, _ in rows], dtype=np.int64)) or stated or "ns"
     if unit != "ns":
         warnings.append(f"times of {camera.name}/data.csv are taken for {NAMES[unit]}")
     return [file for _, file in rows], np.array([time / float(PARTS[unit]) for time, _ in rows])

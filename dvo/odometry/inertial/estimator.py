@@ -581,13 +581,16 @@ class InertialEstimator:
                 return None, worlds, reason
         offset = self.first_offset if self.solution is None else self.solution.time_offset
         # Where the sensor's clock is ahead, the newest sample is older than the newest frame.
-        times = nodes.times + offset
+        images, times = nodes.times, nodes.times + offset
         kept = (times <= samples.timestamps[-1] + HELD) & (times - LEAD >= samples.timestamps[0])
         if not kept.all():
             nodes, worlds = _chosen(nodes, worlds, kept)
         enough = self.options.first if not self.aligned else 2 * self.options.interval
         if len(nodes) < 3 or nodes.times[-1] - nodes.times[0] < enough:
-            return None, worlds, "too few poses"
+            if len(images) < 3 or images[-1] - images[0] < enough:
+                return None, worlds, "too few poses"
+            spans = f"from {samples.timestamps[0]:.3f} to {samples.timestamps[-1]:.3f} s"
+            return None, worlds, f"too few samples: they are {spans}, images from {images[0]:.3f} to {images[-1]:.3f} s"
         near = samples.between(nodes.times[0] - 0.5, nodes.times[-1] + 0.5)
         last = float(nodes.times[-1]) + offset + (0.0 if self.aligned else LEAD)
         near = _held(near, min(last, float(samples.timestamps[-1]) + HELD))
@@ -830,7 +833,7 @@ class InertialEstimator:
         self._candidate = None
         if not self.aligned:
             # The same again and again: look more rarely, but not where a little more motion is all that is missing.
-            again = _words(reason) == _words(self.reason) and reason not in _WAITING
+            again = _words(reason) == _words(self.reason) and not reason.startswith(_WAITING)
             if again and "is uncertain" not in reason:
                 self._patience = min(2 * self._patience, MOST_PATIENCE)
             else:
@@ -839,7 +842,7 @@ class InertialEstimator:
             self.reason = reason
             return
         self._failures += 1
-        if self._failures >= FAILURES and reason not in _WAITING:
+        if self._failures >= FAILURES and not reason.startswith(_WAITING):
             self.history.append({"time": time, "event": "withdrawn", "reason": reason})
             self.state, self.reason = ScaleState.INITIALISING, f"withdrawn: {reason}"
             self.worlds, self.solution, self._known, self._failures, self._past = {}, None, [], 0, []

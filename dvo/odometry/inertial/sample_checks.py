@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import permutations, product
 
 import numpy as np
 
+from dvo.data.files.files import MAX_NUMBER
 from dvo.data.inertial import InertialSamples
-from dvo.data.inertial_files.tables import turn_of_gravity
+from dvo.data.inertial_files.tables import RATES, SLOW, turn_of_gravity
 from dvo.data.inertial_files.tidy import GRAVITY_RANGE, STANDARD_GRAVITY
 from dvo.odometry.inertial.findings import Finding, Found, Level
-from dvo.odometry.inertial.temporal import MAX_GAP
+from dvo.odometry.inertial.temporal import MAX_GAP, integrate_gyro
 
 Array = np.ndarray
 MIN_RATE = (20.0, 90.0)
 """Samples a second below which samples are unusable, and below which motion of a hand is not resolved."""
+SHORT = (5.0, 2.0)
+"""Seconds of a recording below which that is told, and below which nothing can be aligned."""
 MISSING = (0.01, 0.3)
 """Share of missing samples that is told, and that makes them unusable."""
 GRAVITY_ERROR = (0.4, 2.0)
 """Deviation of the force at rest from gravity that is told, and that makes samples unusable, m/s^2."""
 GYRO_BIAS = (0.1, 0.35)
 """Bias of the gyroscope that is told, and that makes samples unusable, rad/s."""
+FASTEST = 70.0
+"""Median of the angular rate that no sensor measures, rad/s: 4000 degrees a second."""
 NOISE_RATIO = (0.1, 3.0)
 """Measured over stated density that is told."""
 REST = (0.012, 0.015)
@@ -28,6 +34,20 @@ REST = (0.012, 0.015)
 _BLOCK = 0.1  # seconds of a mean
 _MIN_REST = 2.0  # seconds at rest from which noise is measured
 _REPEATED = 0.2  # share of samples that repeat the one before
+_BURST = 5.0  # mean over median interval from which samples come in bursts
+_CONSTANT = 20  # samples of which an axis should not be the same
+_BOTH_ENDS = 1e-3  # relative difference of the plateaus of an axis that is clipped at both ends
+_TURN, _MEAN, _STRETCH = 2.0, 1.0, 5  # (m/s^2)^2; seconds of a mean of the force; means that are compared
+_ABOUT_TWO = 0.05  # rad/s, deviation of the rates about a second axis
+_LONGEST = 120.0  # seconds that are compared
+_BETTER = 0.2  # share of the variance of gravity that other axes must leave
+_NEAR_AXES = 20.0  # degrees from a permutation of axes within which it is named
+SIGNED_AXES = [
+    np.eye(3)[list(order)] * np.array(signs)[:, None]
+    for order in permutations(range(3))
+    for signs in product((1.0, -1.0), repeat=3)
+]
+"""The 48 ways to swap and mirror axes."""
 _FACTORS = {"g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000}
 
 
@@ -41,7 +61,7 @@ def check_stamps(samples: InertialSamples) -> tuple[InertialSamples, Found]:
         The samples in order, the first of each time, without those that are not finite; and what was found.
     """
     times, findings = samples.timestamps, []
-    finite = np.isfinite(times) & np.isfinite(samples.gyro).all(1) & np.isfinite(samples.accel).all(1)
+    finite = np.isfinite(times) & (np.abs(np.hstack([samples.gyro, samples.accel])) <= MAX_NUMBER).all(1)
     if not finite.all():
         text = f"{int((~finite).sum())} of {len(times)} samples have numbers that are not finite"
         findings.append(Finding("not finite", Level.WARNING, text, "remove these rows"))
@@ -62,7 +82,8 @@ def check_stamps(samples: InertialSamples) -> tuple[InertialSamples, Found]:
     )  # fmt: skip
     values = {"samples": len(samples), "duplicate stamps": repeated, "unordered stamps": back}
     if len(ordered) < 3:
-        findings.append(Finding("too few samples", Level.UNUSABLE, f"{len(ordered)} samples", "record for longer"))
+        text = f"{len(ordered)} sample{'s' * (len(ordered) != 1)} at different times"
+        findings.append(Finding("too few samples", Level.UNUSABLE, text, "record for longer"))
         return tidy, Found(values, tuple(findings))
     more = _rhythm(ordered)
     return tidy, Found({**values, **more.values}, (*findings, *more.findings))
@@ -71,22 +92,37 @@ def check_stamps(samples: InertialSamples) -> tuple[InertialSamples, Found]:
 def _rhythm(times: Array) -> Found:
     """Rate, missing samples and gaps of increasing times."""
     steps = np.diff(times)
-    spacing = float(np.median(steps))
+    spacing, duration = float(np.median(steps)), float(times[-1] - times[0])
+    findings = []
+    if duration < SHORT[0]:
+        level = Level.UNUSABLE if duration < SHORT[1] else Level.WARNING
+        findings.append(Finding("short recording", level, f"{duration:.3g} s", "record for thirty seconds"))
+    mean = float(np.minimum(steps, np.quantile(steps, 0.99)).mean())  # but for gaps
+    if mean > _BURST * spacing:
+        bursts = int((steps > _BURST * spacing).sum()) + 1
+        text = f"{len(times) / bursts:.3g} samples at a time, {1 / mean:.3g} a second in the mean"
+        remedy = "write the stamps of the sensor, not those of arrival"
+        findings.append(Finding("bursts", Level.UNUSABLE, text, remedy))
+        values = {"rate, Hz": 1 / mean, "duration, s": duration, "longest gap, s": float(steps.max())}
+        return Found(values, tuple(findings))
     lost = np.where(steps > 1.6 * spacing, np.round(steps / spacing) - 1, 0)
     share = float(lost.sum() / (lost.sum() + len(times)))
     gaps = steps[steps > max(MAX_GAP, 3 * spacing)]
     uneven = float(np.mean(np.abs(steps - spacing) > 0.5 * spacing))
     values = {
-        "rate, Hz": 1 / spacing, "duration, s": float(times[-1] - times[0]), "missing share": share,
+        "rate, Hz": 1 / spacing, "duration, s": duration, "missing share": share,
         "gaps": len(gaps), "longest gap, s": float(steps.max()),
     }  # fmt: skip
-    findings = []
     if 1 / spacing < MIN_RATE[1]:
         level = Level.UNUSABLE if 1 / spacing < MIN_RATE[0] else Level.WARNING
-        findings.append(Finding("low rate", level, f"{1 / spacing:.3g} samples a second", "record at 100 to 400 Hz"))
+        remedy = "record at 100 to 400 Hz" + (", and check the unit of the times" if 1 / spacing < SLOW else "")
+        findings.append(Finding("low rate", level, f"{1 / spacing:.3g} samples a second", remedy))
+    if 1 / spacing > RATES[1]:
+        text, remedy = f"{1 / spacing:.4g} samples a second", "check the unit of the times"
+        findings.append(Finding("high rate", Level.UNUSABLE, text, remedy))
     if share > MISSING[0]:
         level = Level.UNUSABLE if share > MISSING[1] else Level.WARNING
-        text = f"{100 * share:.2g} % of the samples are not there, at {1 / spacing:.4g} Hz"
+        text = f"{100 * share:.3g} % of the samples are not there, at {1 / spacing:.4g} Hz"
         findings.append(Finding("missing samples", level, text, "write to a faster disk, or at a lower rate"))
     if len(gaps):
         text = f"{len(gaps)} gaps of {gaps.min():.3g} to {gaps.max():.3g} s, {gaps.sum():.3g} s together"
@@ -137,6 +173,10 @@ def _in_units(samples: InertialSamples) -> tuple[InertialSamples, Found]:
     if ratio is not None and 0.5 < np.rad2deg(ratio) < 2:
         samples, finding = in_radians(samples, f"gravity turns {1 / ratio:.3g} times slower than it says")
         findings.append(finding)
+    rate = float(np.median(np.linalg.norm(samples.gyro, axis=1)))
+    if rate > FASTEST and not any(finding.name == "gyroscope unit" for finding in findings):
+        text = f"the median of the gyroscope is {rate:.4g} rad/s, which no sensor measures"
+        findings.append(Finding("gyroscope unit", Level.UNUSABLE, text, "give it in rad/s; counts are no unit"))
     return samples, Found(values, tuple(findings))
 
 
@@ -155,27 +195,113 @@ def _range(samples: InertialSamples) -> Found:
     """Clipped plateaus, and values that stay the same."""
     findings = []
     sensors = (("gyroscope", samples.gyro, 2.0, "rad/s"), ("accelerometer", samples.accel, 15.0, "m/s^2"))
-    share = float(np.mean((np.diff(samples.gyro, axis=0) == 0).all(1)))
     for name, rows, least, unit in sensors:
         clipped, bound = 0, 0.0
-        for values in (*rows.T, *-rows.T):
-            top = float(values.max())
-            at = np.flatnonzero(values >= top - 1e-6 * abs(top))
-            runs = [len(run) for run in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1) if len(run) >= 3]
-            # one short run may be a slow turning point between steps of the converter
-            count = sum(runs) if len(runs) > 1 or max(runs, default=0) >= 10 else 0
-            if top > least and count and top > 3 * float(np.median(np.abs(values))):
-                clipped, bound = clipped + count, max(bound, top)
+        for axis in rows.T:
+            ends = [_plateau(values) for values in (axis, -axis)]
+            tops = [end[0] for end in ends]
+            both = all(count for _, count in ends) and abs(tops[0] - tops[1]) <= _BOTH_ENDS * max(tops)
+            for top, count in ends:
+                if top > least and count and (both or top > 3 * float(np.median(np.abs(axis)))):
+                    clipped, bound = clipped + count, max(bound, top)
         if clipped:
             text = f"{clipped} samples of the {name} stand at {bound:.4g} {unit}"
             remedy = "set a larger range of the sensor, or move less violently"
             findings.append(Finding("saturation", Level.WARNING, text, remedy))
-    if share > _REPEATED:
-        text = f"{100 * share:.0f} % of the samples repeat the one before"
-        remedy = "record at the rate of the sensor: samples are held, or it stands still in a stuck driver"
-        level = Level.UNUSABLE if share > 0.95 else Level.WARNING
-        findings.append(Finding("repeated samples", level, text, remedy))
+        same = np.diff(rows, axis=0) == 0
+        share = float(same.all(1).mean())
+        if share > _REPEATED:
+            text = f"{100 * share:.0f} % of the samples of the {name} repeat the one before"
+            remedy = "record at the rate of the sensor: samples are held, or it stands still in a stuck driver"
+            if share == 1:
+                text = f"the {name} is {', '.join(f'{value:.4g}' for value in rows[0])} {unit} in all samples"
+                remedy = "check that the sensor is on, and its columns"
+            level = Level.UNUSABLE if share > 0.95 else Level.WARNING
+            findings.append(Finding("repeated samples", level, text, remedy))
+        elif len(rows) > _CONSTANT:
+            for axis in np.flatnonzero(same.all(0)):
+                text = f"{'xyz'[axis]} of the {name} is {rows[0, axis]:.4g} {unit} in all samples"
+                remedy = "check the sensor and its columns; a simulation may move like this"
+                findings.append(Finding("constant axis", Level.WARNING, text, remedy))
     return Found({}, tuple(findings))
+
+
+def _plateau(values: Array) -> tuple[float, int]:
+    """Largest value, and how many samples stand at it for a while."""
+    top = float(values.max())
+    at = np.flatnonzero(values >= top - 1e-6 * abs(top))
+    runs = [len(run) for run in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1) if len(run) >= 3]
+    # one short run may be a slow turning point between steps of the converter
+    return top, sum(runs) if len(runs) > 1 or max(runs, default=0) >= 10 else 0
+
+
+def check_axes(samples: InertialSamples) -> Finding | None:
+    """Check that gravity turns in the accelerometer as the gyroscope says, without a camera.
+
+    The force is turned by the gyroscope from a second to the next for some seconds, with the 48 ways to swap and mirror
+    the axes of the gyroscope; with the right ones its means are the same, but for changes of the velocity.
+
+    Args:
+        samples: with increasing times, in rad/s and m/s^2.
+
+    Returns:
+        A finding if the axes of the sensors differ, or are left-handed; None where the motion does not tell.
+    """
+    part = samples.between(-np.inf, float(samples.timestamps[0]) + _LONGEST)
+    times = part.timestamps
+    number = ((times - times[0]) / _MEAN).astype(int)
+    blocks = int(number[-1]) // _STRETCH * _STRETCH  # whole ones
+    counts = np.bincount(number, minlength=blocks)[:blocks]
+    if blocks < 2 * _STRETCH or counts.min() < 5 or np.linalg.eigvalsh(np.cov(part.gyro.T))[1] < _ABOUT_TWO**2:
+        return None  # an arm that swings about one axis turns forces like gravity
+    products = []
+    for gyro in (part.gyro, -part.gyro):
+        turns = integrate_gyro(times, gyro, np.zeros(3)).rotations
+        each = (turns[..., None] * part.accel[:, None, None]).reshape(-1, 27)
+        sums = np.stack([np.bincount(number, column, blocks)[:blocks] for column in each.T], 1)
+        products.append((sums / counts[:, None]).reshape(-1, 3, 3, 3))
+    spread, sizes = [], []
+    for option in SIGNED_AXES:
+        is_mirrored = bool(np.linalg.det(option) < 0)
+        rotation = -option if is_mirrored else option
+        force = np.einsum("ai,bijk,kj->ba", rotation, products[is_mirrored], rotation)
+        force = force.reshape(-1, _STRETCH, 3)
+        spread.append(float(force.var(1).sum(1).mean()))
+        sizes.append(float(np.median(np.linalg.norm(force.mean(1), axis=1))))
+    same = spread[next(k for k, option in enumerate(SIGNED_AXES) if np.array_equal(option, np.eye(3)))]
+    least = int(np.argmin(spread))
+    best, is_gravity = SIGNED_AXES[least], abs(sizes[least] - STANDARD_GRAVITY) < 0.1 * STANDARD_GRAVITY
+    if same < _TURN or spread[least] > _BETTER * same or not is_gravity:
+        return None
+    named = named_axes(best)
+    if np.linalg.det(best) > 0:
+        text = f"gravity turns as the gyroscope taken as {named} says: the axes of the sensors differ"
+        remedy = f"give the accelerometer as {named_axes(best.T)}, or with the other signs if that reads -9.8 upwards"
+    else:
+        text = f"gravity turns as the gyroscope taken as {named} says: a sign is wrong, or axes are left-handed"
+        remedy = f"give the gyroscope as {named}; of left-handed axes, change the sign of one of both sensors"
+    return Finding("accelerometer axes", Level.UNUSABLE, text, remedy)
+
+
+def named_axes(matrix: Array) -> str | None:
+    """Order and signs of axes that a nearly signed permutation means, such as ``(y, x, -z)``.
+
+    Args:
+        matrix: ``(3, 3)`` orthogonal.
+
+    Returns:
+        None if it is not near one, or changes nothing.
+    """
+    best = max(SIGNED_AXES, key=lambda option: float((option * matrix).sum()))
+    turn = matrix @ best.T
+    cosine = (np.trace(turn) - 1) / 2
+    if cosine < np.cos(np.radians(_NEAR_AXES)) or np.array_equal(best, np.eye(3)):
+        return None
+    parts = []
+    for row in best:
+        axis = int(np.argmax(np.abs(row)))
+        parts.append(("-" if row[axis] < 0 else "") + "xyz"[axis])
+    return f"({', '.join(parts)})"
 
 
 def still_stretches(samples: InertialSamples) -> list[slice]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dvo.data.inertial import InertialSamples
 from dvo.odometry.inertial.findings import Finding, Level, SensorReport
-from dvo.odometry.inertial.sample_checks import check_stamps, check_values
+from dvo.odometry.inertial.sample_checks import check_axes, check_stamps, check_values
 from dvo.odometry.inertial.vision_checks import check_against_vision
 
 _GRAVITY = tuple(Level)  # the gravest first
@@ -54,6 +54,8 @@ def check_sensor(
             text = "the pose of the sensor in the camera is not stated"
             remedy = "state T_camera_imu in --imu-calib, or calibrate with Kalibr"
             findings.append(Finding("no extrinsics", Level.WARNING, text, remedy))
+    axes = None if {"axes", "accelerometer axes"} & {one.name for one in findings} else check_axes(samples)
+    findings += [] if axes is None else [axes]
     if samples.noise is None:
         text = "the noise of the sensor is not stated, that of a phone is assumed"
         remedy = "state noise, or a preset (euroc, action, phone), in --imu-calib"

@@ -74,6 +74,6 @@ class SampleStream:
         if not (np.diff(times) > 0).all():  # some came late, or twice
             times, order = np.unique(times, return_index=True)
             values = values[order]
-        recent = times >= times[-1] - self.seconds
         last = parts[-1]
+        recent = times >= last.timestamps[-1] - self.seconds  # a wrong time in the future costs no others
         return InertialSamples(times[recent], values[recent, :3], values[recent, 3:], last.T_camera_imu, last.noise)

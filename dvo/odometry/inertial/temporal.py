@@ -38,6 +38,7 @@ MAX_SIGMA_OFFSET = 0.01  # seconds
 MAX_SIGMA_ROTATION = 1.5  # degrees
 _STEPS = 12
 _FINE = 0.002  # seconds between orientations in the search
+_LONGEST = 7200.0  # seconds of samples that are integrated
 _UNKNOWN = (np.inf, np.inf, np.inf)
 
 
@@ -223,6 +224,12 @@ def align_imu(
     )
     if len(timestamps) < MIN_INTERVALS or len(imu_times) < MIN_INTERVALS:
         return replace(nothing, reason=f"{len(timestamps)} frames and {len(imu_times)} samples are too few")
+    if imu_times[-1] - imu_times[0] > _LONGEST:  # hours without frames, or a clock that jumps
+        reach = max_offset + interval + 1
+        near = (imu_times >= timestamps[0] - reach) & (imu_times <= timestamps[-1] + reach)
+        imu_times, gyro = imu_times[near], gyro[near]
+        if len(imu_times) < MIN_INTERVALS or imu_times[-1] - imu_times[0] > _LONGEST:
+            return replace(nothing, reason=f"{len(imu_times)} samples at the times of the frames")
     turns = _Turns.of(timestamps, rotations_wc, interval)
     raw = integrate_gyro(imu_times, gyro, np.zeros(3))
     if len(turns.first) < MIN_INTERVALS:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import permutations, product
 
 import numpy as np
 
 from dvo.data.inertial import InertialSamples
 from dvo.geometry.poses import matrix_to_quaternion, quaternion_to_matrix, rotation_vector
 from dvo.odometry.inertial.findings import Finding, Found, Level
-from dvo.odometry.inertial.sample_checks import gravity_error, gyro_bias, in_radians
+from dvo.odometry.inertial.sample_checks import SIGNED_AXES, gravity_error, gyro_bias, in_radians, named_axes
 from dvo.odometry.inertial.temporal import ImuAlignment, align_imu, integrate_gyro
 
 Array = np.ndarray
@@ -22,18 +21,11 @@ ANGLE = (3.0, 10.0)
 """Difference of the rotation from the stated one that is told, and that makes samples unusable, degrees."""
 ACCEL_BIAS = (0.5, 2.0)
 """Bias of the accelerometer that is told, and that makes samples unusable, m/s^2."""
-_NEAR_AXES = 20.0  # degrees from a permutation of axes within which it is named
 _WIDE = 3.0  # seconds on either side of a second search, where the first one finds no offset
 _WINDOW = 4.0  # seconds of vision for one point of the line of offsets
 _MIN_WINDOWS = 3
 _MEAN = 0.5  # seconds over which the force is averaged
 _TELLS = 0.5  # share of the variance that other axes of the accelerometer must leave
-_SIGNED = [
-    np.eye(3)[list(order)] * np.array(signs)[:, None]
-    for order in permutations(range(3))
-    for signs in product((1.0, -1.0), repeat=3)
-]
-"""The 48 ways to swap and mirror axes."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +202,7 @@ def _axes(found: ImuAlignment, stated: Array | None) -> Found:
     """Rotation against the stated one; swapped and mirrored axes."""
     if found.mirrored and found.axes is not None:
         text = "no rotation explains the gyroscope, a reflection does: axes are swapped or have the wrong sign"
-        named = None if stated is None else _named(stated.T @ found.axes)
+        named = None if stated is None else named_axes(stated.T @ found.axes)
         remedy = f"give the samples as {named}" if named else "correct the order and the signs of the axes"
         return Found({}, (Finding("axes", Level.UNUSABLE, text, remedy),))
     if not found.is_rotation_told:
@@ -233,7 +225,7 @@ def _axes(found: ImuAlignment, stated: Array | None) -> Found:
     sigma = float(np.linalg.norm(found.sigma_rotation))
     if angle <= max(ANGLE[0], 4 * sigma):
         return Found(values)
-    named = _named(stated.T @ rotation)
+    named = named_axes(stated.T @ rotation)
     text = f"the rotation from sensor to camera is {angle:.3g} degrees off the stated one"
     remedy = f"state the rotation of {pose}"
     if float(np.degrees(np.linalg.norm(rotation_vector(stated @ rotation)))) < ANGLE[0] + 4 * sigma:
@@ -242,21 +234,6 @@ def _axes(found: ImuAlignment, stated: Array | None) -> Found:
         text, remedy = f"{text}: axes are swapped", f"give the samples as {named}"
     level = Level.UNUSABLE if angle > ANGLE[1] else Level.WARNING
     return Found(values, (Finding("axes", level, text, remedy),))
-
-
-def _named(matrix: Array) -> str | None:
-    """Order and signs of axes that a nearly signed permutation means, such as ``(y, x, -z)``; None if it is not near
-    one, or changes nothing."""
-    best = max(_SIGNED, key=lambda option: float((option * matrix).sum()))
-    turn = matrix @ best.T
-    cosine = (np.trace(turn) - 1) / 2
-    if cosine < np.cos(np.radians(_NEAR_AXES)) or np.array_equal(best, np.eye(3)):
-        return None
-    parts = []
-    for row in best:
-        axis = int(np.argmax(np.abs(row)))
-        parts.append(("-" if row[axis] < 0 else "") + "xyz"[axis])
-    return f"({', '.join(parts)})"
 
 
 def _biases(samples: InertialSamples, found: ImuAlignment, timestamps: Array, rotations_wc: Array) -> Found:
@@ -269,10 +246,10 @@ def _biases(samples: InertialSamples, found: ImuAlignment, timestamps: Array, ro
     turns, forces = _world(samples, found, timestamps, rotations_wc)
     if len(turns) < 8:
         return Found(values, tuple(findings))
-    spread = [float(np.einsum("nij,nj->ni", turns @ option, forces).var(0).sum()) for option in _SIGNED]
+    spread = [float(np.einsum("nij,nj->ni", turns @ option, forces).var(0).sum()) for option in SIGNED_AXES]
     best, same = int(np.argmin(spread)), spread[_identity()]
     if spread[best] < _TELLS * same and same > 0.5:
-        remedy = f"give the accelerometer as {_named(_SIGNED[best])}"
+        remedy = f"give the accelerometer as {named_axes(SIGNED_AXES[best])}"
         text = "the accelerometer does not see gravity where the gyroscope turns it: their axes differ"
         findings.append(Finding("accelerometer axes", Level.UNUSABLE, text, remedy))
         return Found(values, tuple(findings))
@@ -298,7 +275,7 @@ def _biases(samples: InertialSamples, found: ImuAlignment, timestamps: Array, ro
 
 
 def _identity() -> int:
-    return next(k for k, option in enumerate(_SIGNED) if np.array_equal(option, np.eye(3)))
+    return next(k for k, option in enumerate(SIGNED_AXES) if np.array_equal(option, np.eye(3)))
 
 
 def _world(

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.core.errors import DvoError
 from dvo.data.inertial import InertialSamples, checked_samples
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
@@ -47,6 +48,8 @@ MOST_WRONG, LEAST_WRONG = 0.5, np.deg2rad(0.5)
 """Share of the turn between frames by which the gyroscope may err, or else angle, where it tells that in a readout."""
 FORGET = 0.9
 """Weight of the past in these errors, from frame to frame."""
+ANOTHER_CLOCK = 86400.0
+"""Seconds between a sample and the newest frame that are no pause and no delay."""
 MOST_NODES = 400
 """Nodes of the estimate at the end of a sequence."""
 
@@ -116,11 +119,32 @@ class InertialTracking:
         """Readout time that most frames so far have been corrected for, see :meth:`read_at_once`; 0: they have not."""
         return self._readout if 2 * self._read_at_once > len(self.graph.log.frames) else 0.0
 
+    def add_apart(self, samples: InertialSamples) -> None:
+        """Take samples that do not come with a frame.
+
+        Args:
+            samples: of the sensor.
+
+        Raises:
+            DvoError: damaged samples, or times of another clock than that of the frames.
+        """
+        frames = self.graph.log.frames
+        if self.options.use and frames and len(checked_samples(samples)):
+            ahead = float(samples.timestamps[-1]) - frames[-1].timestamp
+            if abs(ahead) > ANOTHER_CLOCK:
+                message = f"samples are {abs(ahead):.6g} s {'after' if ahead > 0 else 'before'} the newest frame"
+                remedy = "give times of frames and samples on one clock, in seconds"
+                raise DvoError(message, field="inertial: timestamps", remedy=remedy)
+        self.add(samples)
+
     def add(self, samples: InertialSamples) -> None:
         """Take samples.
 
         Args:
             samples: of the sensor.
+
+        Raises:
+            DvoError: damaged samples.
         """
         if self.options.use and self.graph.recording.segment > 0 and len(checked_samples(samples)):
             self._unused = "a map that is tracked in keeps its own unit and axes"

@@ -304,14 +304,14 @@ class PatchOdometry:
             samples: on the clock of the frames; the first with an extrinsic calibration and noise decide these.
 
         Raises:
-            DvoError: times that do not increase, or values that are not finite.
+            DvoError: times that do not increase or are those of another clock, or values that are not finite.
 
         Example:
             >>> odometry = dvo.load("small")
             >>> odometry.add_inertial(InertialSamples(times, gyro, accel, T_camera_imu))
             >>> estimate = odometry.track(frame)
         """
-        self.inertial.add(samples)
+        self.inertial.add_apart(samples)
 
     @checked_arguments
     def save(self, file: str | Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 
 import dvo
 from dvo.core.errors import DvoError
-from dvo.data.companions.inertial_source import described
+from dvo.data.companions.inertial_source import InertialInput, described
 from dvo.data.inertial import NOISE_PRESETS
 from dvo.data.inertial_files.imu_calibration import ImuCalibration
+from dvo.data.readers.euroc import read_inertial
 
 HEADER = "time [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
 NS = 1403636579758555392
@@ -70,6 +72,72 @@ def test_none_gives_none(make, video):
     assert source.inertial is None and next(iter(source)).inertial is None
     with pytest.raises(DvoError, match="imu_calib: there are no inertial samples"):
         open_(video, imu="none", imu_calib="phone")
+
+
+@pytest.mark.parametrize(
+    ("start", "count", "told"), [(0.0, 50, "cover 49 %"), (0.7, 120, "cover 3. %"), (0.0, 120, "")]
+)
+def test_samples_of_a_part_of_the_frames_are_told(make, video, start, count, told):
+    make.text("other.csv", table(start, count))
+    notes = [note for note in open_(video, imu="other.csv").warnings if "cover" in note]
+    assert len(notes) == bool(told) and all(re.search(told, note) for note in notes)
+
+
+def test_a_sensor_that_is_off_is_told(make, video):
+    make.text("other.csv", re.sub(r"(?m)^([0-9.]+),[0-9]+,", r"\1,0,", table()))
+    notes = [note for note in open_(video, imu="other.csv").warnings if "in all samples" in note]
+    assert any(note.startswith("the gyroscope is 0, 0, 0 in all samples") for note in notes)
+
+
+def euroc(rate: float = 100.0, gyro: float = 0.1, accel: float = 9.8, count: int = 300) -> str:
+    """Rows of ``imu0/data.csv`` on a clock that begins at zero, of a sensor that turns about its first axis."""
+    rows = []
+    for k in range(count):
+        angle = np.sin(k / rate)
+        force = (0, accel * np.cos(angle), -accel * np.sin(angle))
+        rows.append(
+            f"{round(k * 1e9 / rate)},{gyro * np.cos(k / rate):.6f},0.01,0.5,{','.join(f'{f:.6f}' for f in force)}"
+        )
+    return "#timestamp [ns],...\n" + "\n".join(rows) + "\n"
+
+
+def test_nanoseconds_of_a_clock_that_has_just_begun_are_no_dates(make):
+    """Their median, 1.5e9, is a date in seconds."""
+    samples = read_inertial(make.text("data.csv", euroc()))
+    assert samples.timestamps[-1] == pytest.approx(2.99) and samples.rate == pytest.approx(100)
+    dates = read_inertial(
+        make.text("data.csv", "\n".join(f"{1_600_000_000_000 + 10 * k},0.1,0,0,0,9.8,0" for k in range(9)))
+    )
+    assert dates.timestamps[0] == 1.6e9 and dates.rate == pytest.approx(100, rel=1e-3)
+
+
+def test_decimal_commas_of_euroc_are_refused(make):
+    text = "\n".join(row.replace(",", ";").replace(".", ",") for row in euroc().splitlines()[1:])
+    with pytest.raises(DvoError, match="decimal commas"):
+        read_inertial(make.text("data.csv", text))
+
+
+REMARKS = {
+    "none": ("", "there are no inertial samples"),
+    "of a slow logger": (euroc(10.0), "10 inertial samples a second, not 15 to 5000"),
+    "without gravity": (euroc(accel=2.0), "the median of the accelerometer is 2 m/s"),
+    "of a sensor that is off": (
+        re.sub(r"(?m)^([0-9]+),[^,]*,[^,]*,[^,]*", r"\1,0,0,0", euroc()),
+        "the gyroscope is 0, 0, 0 in",
+    ),
+    "in degrees": (euroc(gyro=57.3), "gravity turns 0.017"),
+    "of another clock": (euroc(), "from 0.000 to 2.990 s cover 0 % of the frames from 10.000 to 20.000 s"),
+    "as they should be": (euroc(gyro=1.0), ""),
+}
+
+
+@pytest.mark.parametrize("case", REMARKS)
+def test_samples_of_a_data_set_that_are_of_little_use_are_told(make, case):
+    text, told = REMARKS[case]
+    file = make.text("data.csv", text)
+    span = (10.0, 20.0) if "clock" in case else None
+    notes = InertialInput(lambda rough=False: read_inertial(file), ImuCalibration(), span).samples.notes
+    assert any(told in note for note in notes) if told else not notes
 
 
 @pytest.mark.parametrize("start", [100.0, -50.0])

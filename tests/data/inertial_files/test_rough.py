@@ -40,3 +40,29 @@ def test_units_that_are_not_clear_are_left(tmp_path: Path, scale: float) -> None
     samples = given.rough()
     assert np.allclose(samples.timestamps, times - 0.5) and np.allclose(samples.accel, [0, 9.8 * scale, 0])
     assert np.allclose(samples.gyro, [0.1, 0.2, 0.3])
+
+
+STAMPS = np.arange(200) / 100
+ODD = {
+    "s": np.arange(200) * 0.104,
+    "ms": 1_700_000_000_000 + np.arange(200) * 200,
+    "us": np.arange(200) * 104_167,
+    "ns": np.arange(200) * 10**8,
+    "bursts": np.arange(200) // 10 * 0.1 + STAMPS % 0.1 * 1e-3,
+    "the same": STAMPS * 0 + 3,
+    "no order": STAMPS[::-1],
+    "one": STAMPS[:1],
+}
+
+
+@pytest.mark.parametrize("is_stated", [False, True])
+@pytest.mark.parametrize("case", ODD)
+def test_any_rate_is_read(tmp_path: Path, case: str, is_stated: bool) -> None:
+    parts = {"ms": 10**3, "us": 10**6, "ns": 10**9}.get(case, 1)
+    unit = f" [{case if parts > 1 else 's'}]" if is_stated else ""
+    rows = [f"{t},0.1,0.2,0.3,0,9.8,0" for t in ODD[case].tolist()]
+    file = tmp_path / "imu.csv"
+    file.write_text("\n".join([f"time{unit},gx,gy,gz,ax,ay,az", *rows]))
+    with pytest.raises(DvoError, match="times?:"):
+        read_inertial_table(file)
+    assert np.allclose(read_inertial_table(file, rough=True).timestamps, ODD[case] / parts, rtol=0, atol=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +34,28 @@ APPS = {
     "degrees by gravity": ("time,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z", [TIMES, np.degrees(GYRO), ACCEL], ","),
     "radians by gravity": ("t,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z", [TIMES, GYRO, ACCEL], ","),
     "no header": ("", [TIMES * 1e9, ACCEL, GYRO], ","),
+    "units behind the names": ("timestamp_us,gyro_x_dps,gyro_y_dps,gyro_z_dps,acc_x_m_s2,acc_y_m_s2,acc_z_m_s2",
+                               [TIMES * 1e6, np.degrees(GYRO), ACCEL], ","),
+    "milli-g behind the names": ("t_ms,gx_rad_s,gy_rad_s,gz_rad_s,ax_mg,ay_mg,az_mg",
+                                 [TIMES * 1e3, GYRO, ACCEL * 1e3 / STANDARD_GRAVITY], ","),
+    "units in a line of their own": ("t,gx,gy,gz,ax,ay,az\n[ms],[deg/s],[deg/s],[deg/s],[g],[g],[g]",
+                                     [TIMES * 1e3, np.degrees(GYRO), ACCEL / STANDARD_GRAVITY], ","),
+    "lines above the header": ("Device: Pixel, 7\nRate,100\n\nt,gx,gy,gz,ax,ay,az", [TIMES, GYRO, ACCEL], ","),
+    "blanks in a header without marks": ("time [s] gx [rad/s] gy [rad/s] gz [rad/s] ax [m/s^2] ay [m/s^2] az [m/s^2]",
+                                         [TIMES, GYRO, ACCEL], " "),
+    "a clock that stands beside one that goes": ("time,seconds_elapsed,gx,gy,gz,ax,ay,az",
+                                                 [1.6e9 + TIMES // 1, TIMES, GYRO, ACCEL], ","),
     "tum-vi text": ("# timestamp[s] wx[rad/s] wy[rad/s] wz[rad/s] ax[m/s^2] ay[m/s^2] az[m/s^2]",
                     [TIMES, GYRO, ACCEL], " "),
 }  # fmt: skip
+
+
+HEADER = "time [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
+
+
+def rows_of(times: np.ndarray) -> list[str]:
+    table = np.column_stack([times, GYRO[: len(times)], ACCEL[: len(times)]])
+    return [",".join(repr(value) for value in row) for row in table.tolist()]
 
 
 @pytest.mark.parametrize("app", APPS)
@@ -46,7 +66,18 @@ def test_one_file(tmp_path, app):
     check(read_inertial_table(write(tmp_path / "imu.csv", header, columns, mark, form)))
 
 
+@pytest.mark.parametrize("header", [HEADER, ""])
+@pytest.mark.parametrize("mark", [",", ";"])
+def test_marks_at_the_end_of_rows_quotes_and_decimal_commas(tmp_path, header, mark):
+    """A byte order mark, decimal commas within quotes, and an empty column at the end."""
+    rows = [mark.join('"' + cell.replace(".", ",") + '"' for cell in row.split(",")) + mark for row in rows_of(TIMES)]
+    (tmp_path / "imu.csv").write_text("\n".join([header.replace(",", mark), *rows]), encoding="utf-8-sig")
+    check(read_inertial_table(tmp_path / "imu.csv"))
+
+
 GUESSES = {"degrees by gravity": "deg/s (as gravity turns)", "radians by gravity": "rad/s (as gravity turns)",
+           "lines above the header": "2 lines above the header not read",
+           "a clock that stands beside one that goes": "times are those of seconds_elapsed",
            "stray scanner": "Apple", "no header": "accelerometer, gyroscope"}  # fmt: skip
 
 
@@ -83,6 +114,26 @@ def test_opencamera_sensors(tmp_path, given):
     check(read_inertial_table(tmp_path / given), 5000.0)
 
 
+def test_a_file_of_the_linear_acceleration_is_no_accelerometer(tmp_path):
+    write(tmp_path / "Gyroscope.csv", '"Time (s)","Gyroscope x (rad/s)","Gyroscope y (rad/s)","Gyroscope z (rad/s)"',
+          [TIMES, GYRO])  # fmt: skip
+    names = ",".join(f'"Linear Acceleration {axis} (m/s^2)"' for axis in "xyz")
+    write(tmp_path / "Linear Acceleration.csv", f'"Time (s)",{names}', [TIMES, ACCEL])
+    for name in ("Gyroscope.csv", "Linear Acceleration.csv"):
+        with pytest.raises(DvoError, match="accel: gravity was removed from Linear Acceleration.*with gravity"):
+            read_inertial_table(tmp_path / name)
+
+
+def test_numbers_out_of_bounds_are_dropped_without_warnings(tmp_path):
+    gyro = GYRO.copy()
+    gyro[::7] = 1e300
+    gyro[3] = np.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        samples = read_inertial_table(write(tmp_path / "imu.csv", "t,gx,gy,gz,ax,ay,az", [TIMES, gyro, ACCEL]))
+    assert len(samples) == COUNT - 87 and any("87 rows without finite numbers" in note for note in samples.notes)
+
+
 @pytest.mark.parametrize("mark", ["\t", ";"])
 def test_phyphox_with_decimal_commas(tmp_path, mark):
     for name, unit, values in (("Gyroscope", "rad/s", GYRO), ("Accelerometer", "m/s^2", ACCEL)):
@@ -109,14 +160,6 @@ def test_spectacular_ai(tmp_path, end):
         read_inertial_table(file)
 
 
-HEADER = "time [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
-
-
-def rows_of(times: np.ndarray) -> list[str]:
-    table = np.column_stack([times, GYRO[: len(times)], ACCEL[: len(times)]])
-    return [",".join(repr(value) for value in row) for row in table.tolist()]
-
-
 def test_damage_is_repaired_and_told(tmp_path):
     rows = rows_of(TIMES)
     rows[10], rows[11] = rows[11], rows[10]
@@ -137,7 +180,14 @@ BAD = {
     "a clock that is set back": (rows_of(np.concatenate([TIMES[:300] + 100, TIMES[:300]])), "set back by 1"),
     "a row of another width": ([*rows_of(TIMES)[:5], "1,2,3", *rows_of(TIMES)[5:]], "row 6 has 3 columns, not 7"),
     "one sample a second": (rows_of(TIMES * 100), "1 samples a second"),
-    "the same time": (rows_of(0 * TIMES), "do not increase"),
+    "the same time": (rows_of(0 * TIMES), "do not increase: all 600 are 0. Write them with more digits"),
+    "one sample": (rows_of(TIMES[:1]), "1 sample. Record for longer"),
+    "a clock that is set forward": (rows_of(TIMES + 1.7e9 * (TIMES > 1)), "set forward by 1.7e.09 s at sample 101"),
+    "a clock of hundredths": (rows_of(np.arange(COUNT) // 4 * 0.04), "450 of 600 samples have the time of another one"),
+    "a clock of tenths": (rows_of(np.arange(COUNT) // 10 * 0.1), "10 samples a second: 90 % of the rows have the time"),
+    "bursts": (rows_of(np.arange(COUNT) // 10 * 0.1 + TIMES % 0.1 * 1e-3), "in bursts: .*stamps of the sensor"),
+    "no order at all": (rows_of(TIMES[np.random.default_rng(0).permutation(COUNT)]), "set back by"),
+    "a slow logger": (rows_of(TIMES * 10.4), "9.615 samples a second"),
 }
 
 
@@ -159,6 +209,22 @@ UNCLEAR = {
     "no times": (HEADER.replace("time [s]", "row"), [TIMES, GYRO, ACCEL], "no column of times"),
     "no accelerometer": ("time [s],gx,gy,gz", [TIMES, GYRO], "only the gyroscope in it"),
     "times without a unit": (HEADER.replace("time [s]", "time"), [TIMES * 10, GYRO, ACCEL], "unit of the times"),
+    "a slow logger without a unit": ("time,gx,gy,gz,ax,ay,az", [TIMES * 12, GYRO, ACCEL], "8.333 samples a second, if"),
+    "a slow logger or a fast one": (
+        "time,gx,gy,gz,ax,ay,az",
+        [np.arange(COUNT) * 200, GYRO, ACCEL],
+        "5 samples a second in ms, 5000 in us",
+    ),
+    "linear acceleration": (
+        "t,gyro_x,gyro_y,gyro_z,linear_acceleration_x,linear_acceleration_y,linear_acceleration_z",
+        [TIMES, GYRO, ACCEL],
+        "gravity was removed from linear_acceleration_x",
+    ),
+    "linear acceleration alone": (
+        "t,lin_acc_x,lin_acc_y,lin_acc_z",
+        [TIMES, ACCEL],
+        "gravity was removed from lin_acc_x",
+    ),
     "too few columns": (HEADER, [TIMES, GYRO], "the header has 7 columns, the rows have 4"),
 }
 

@@ -23,7 +23,7 @@ from dvo.odometry.protocol import Odometry, Status
 from dvo.synth.sensors.imu import measure_imu
 from tests.support.inertial_world import FOCAL, RATE, T_CAMERA_IMU, Hand, Straight, world
 
-QUIET = ImuNoise(0, 0, 0, 0, 0, 0)
+QUIET = ImuNoise(*[1e-12] * 6)
 UP = np.array([0.0, 0, 1])
 seeds = st.integers(0, 2**32 - 1)
 
@@ -89,7 +89,7 @@ def test_heading_and_position_stay_unknown_with_first_estimates(seed):
 
 
 def test_the_covariance_is_that_of_many_runs():
-    rng, noise = np.random.default_rng(0), ImuNoise(0.02, 0.0, 0.2, 0.0, 0, 0)
+    rng, noise = np.random.default_rng(0), ImuNoise(0.02, 1e-12, 0.2, 1e-12)
     stretch, motion = stretch_of(rng, 6), motion_of(rng)
     end, _, covariance = propagate(stretch, motion, np.zeros(6), noise)
     errors = []

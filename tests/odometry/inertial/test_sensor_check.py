@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dvo.data.inertial import NOISE_PRESETS, InertialSamples
-from dvo.geometry.poses import invert_poses, so3_exp
+from dvo.geometry.poses import invert_poses, rotation_vector, so3_exp
 from dvo.odometry.inertial.findings import Level, SensorReport
 from dvo.odometry.inertial.sensor_check import check_sensor
 from dvo.odometry.inertial.vision_checks import clock_line
@@ -176,8 +176,119 @@ def test_saturation_and_held_samples() -> None:
     finding = report.named("saturation")
     assert finding is not None and "2.2 rad/s" in finding.text
     assert check_sensor(replace(imu, gyro=clipped)).named("saturation") is None
+    heavily = check_sensor(replace(imu, gyro=(6 * imu.gyro).clip(-2.2, 2.2))).named("saturation")
+    assert heavily is not None and "gyroscope stand at 2.2 rad/s" in heavily.text
     held = np.arange(len(imu)) // 2 * 2
-    assert check_sensor(replace(imu, gyro=imu.gyro[held])).named("repeated samples") is not None
+    for sensor in ("gyro", "accel"):
+        finding = check_sensor(replace(imu, **{sensor: getattr(imu, sensor)[held]})).named("repeated samples")
+        assert finding is not None and f"of the {sensor}" in finding.text
+
+
+def test_sensors_that_are_off() -> None:
+    imu = good()[0]
+    for sensor, value in (("gyro", 0.0), ("accel", 5.7)):
+        report = check_sensor(replace(imu, **{sensor: np.full_like(imu.gyro, value)}))
+        finding = report.named("repeated samples")
+        assert finding is not None and f"{value:g} " in finding.text and f"the {sensor}" in finding.text
+        assert not report.is_usable
+        finding = check_sensor(replace(imu, **{sensor: getattr(imu, sensor) * [1, 0, 1]})).named("constant axis")
+        assert finding is not None and f"y of the {sensor}" in finding.text
+
+
+@pytest.mark.parametrize(
+    ("count", "is_usable"), [(0, False), (1, False), (2, False), (5, False), (50, False), (400, True)]
+)
+def test_short_recordings(count: int, is_usable: bool) -> None:
+    imu = good()[0]
+    report = check_sensor(
+        replace(imu, timestamps=imu.timestamps[:count], gyro=imu.gyro[:count], accel=imu.accel[:count])
+    )  # fmt: skip
+    finding = report.named("short recording") or report.named("too few samples")
+    assert finding is not None and report.is_usable == (count == 400)
+
+
+@pytest.mark.parametrize("rate", [1.0, 9.6, 25.0])
+def test_low_rates(rate: float) -> None:
+    report = check_sensor(samples(hand_motion(21), 30, rate=rate))
+    finding = report.named("low rate")
+    assert finding is not None and f"{rate:.3g} samples a second" in finding.text and "100 to 400 Hz" in finding.remedy
+    assert report.is_usable == (rate > 20)
+
+
+def test_rates_of_another_unit() -> None:
+    imu, times, rotations = good()
+    slow = check_sensor(replace(imu, timestamps=imu.timestamps * 1e3)).named("low rate")
+    assert slow is not None and "0.1 samples a second" in slow.text and "unit of the times" in slow.remedy
+    fast = check_sensor(replace(imu, timestamps=imu.timestamps / 1e3), times, rotations)
+    finding = fast.named("high rate")
+    assert finding is not None and "unit of the times" in finding.remedy and not fast.is_usable
+
+
+def test_counts_of_a_gyroscope() -> None:
+    report = checked(gyro=np.rint(np.degrees(good()[0].gyro) * 131))
+    finding = report.named("gyroscope unit")
+    assert finding is not None and "counts" in finding.remedy and not report.is_usable
+
+
+@pytest.mark.parametrize("jump", [1e5, 1.7e9])
+def test_a_clock_that_jumps_costs_no_memory(jump: float) -> None:
+    imu, times, rotations = good()
+    stamps = np.where(np.arange(len(imu)) < 50, imu.timestamps - jump, imu.timestamps)
+    report = check_sensor(replace(imu, timestamps=stamps), times, rotations)
+    assert report.named("gaps") is not None and abs(report.values["time offset, ms"]) < 1
+    stamps = np.where(np.arange(len(imu)) < 50, imu.timestamps, imu.timestamps + jump)
+    assert check_sensor(replace(imu, timestamps=stamps), times, rotations).named("not told") is not None
+
+
+def test_samples_in_bursts() -> None:
+    imu = good()[0]
+    stamps = np.arange(len(imu)) // 10 * 0.1 + np.arange(len(imu)) % 10 * 1e-5
+    report = check_sensor(replace(imu, timestamps=stamps))
+    finding = report.named("bursts")
+    assert finding is not None and "10 samples at a time" in finding.text and report.named("missing samples") is None
+    assert report.values["rate, Hz"] == pytest.approx(100, rel=0.05)
+
+
+def test_numbers_out_of_bounds() -> None:
+    imu = good()[0]
+    gyro = imu.gyro.copy()
+    gyro[5], gyro[9] = 1e300, np.nan
+    finding = check_sensor(replace(imu, gyro=gyro)).named("not finite")
+    assert finding is not None and finding.text.startswith("2 of")
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel", "words"),
+    [
+        ([1, 0, 2], [0, 1, 2], "gyroscope taken as (y, x, z)"),
+        ([0, 1, 2], [1, 2, 0], "accelerometer as (z, x, y)"),
+    ],
+)
+def test_axes_of_one_sensor_without_a_camera(gyro: list[int], accel: list[int], words: str) -> None:
+    imu = good()[0]
+    finding = check_sensor(replace(imu, gyro=imu.gyro[:, gyro], accel=imu.accel[:, accel])).named("accelerometer axes")
+    assert finding is not None and words in f"{finding.text}; {finding.remedy}"
+
+
+def test_left_handed_axes_without_a_camera() -> None:
+    imu, signs = good()[0], np.array([1, 1, -1])
+    finding = check_sensor(replace(imu, gyro=imu.gyro * signs, accel=imu.accel * signs)).named("accelerometer axes")
+    assert finding is not None and finding.level == Level.UNUSABLE and "left-handed" in finding.text
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_arm_that_swings_has_no_wrong_axes(seed: int) -> None:
+    """Accelerations of a lever of half a metre that turn as fast as gravity does."""
+    rng, times, step = np.random.default_rng(seed), np.arange(3000) / 100, 1e-3
+    fast, size, phase = rng.uniform(0.2, 2.5, 3), rng.uniform(0.1, 0.6, 3), rng.uniform(0, 6, 3)
+    before, turn, after = (
+        so3_exp(size * np.sin(2 * np.pi * fast * (times[:, None] + late) + phase)) for late in (-step, 0, step)
+    )
+    lever = rng.normal(0, 0.3, 3)
+    force = (after @ lever - 2 * (turn @ lever) + before @ lever) / step**2 + np.array([0, 0, 9.81])
+    gyro = rotation_vector(np.swapaxes(before, -1, -2) @ after) / (2 * step)
+    report = check_sensor(InertialSamples(times, gyro, np.einsum("nji,nj->ni", turn, force)))
+    assert report.named("accelerometer axes") is None
 
 
 def test_motion_that_does_not_tell() -> None:

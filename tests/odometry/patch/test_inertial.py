@@ -228,6 +228,41 @@ def test_samples_may_come_late_and_beside_the_frames() -> None:
     bad = replace(whole, gyro=np.full_like(whole.gyro, np.nan))
     with pytest.raises(DvoError, match="finite"):
         odometry.add_inertial(bad)
+    with pytest.raises(DvoError, match="inertial: accel: .*sample 0"):
+        odometry.add_inertial(replace(whole, accel=np.full_like(whole.accel, 1e300)))
+    for late in (1.7e9, -1.7e9, 1e6):
+        with pytest.raises(DvoError, match="inertial: timestamps: samples are .* the newest frame.*one clock"):
+            odometry.add_inertial(replace(whole, timestamps=whole.timestamps + late))
+    odometry.add_inertial(whole.between(0.0, 0.0))
+    same = odometry.inertial.estimator.stream.samples()
+    assert same is not None and same.timestamps.tolist() == whole.timestamps.tolist()
+
+
+def test_samples_of_a_wrong_time_cost_no_others() -> None:
+    odometry, images = tracker(), with_samples(frames(4))
+    for k, frame in enumerate(images):
+        odometry.track(replace(frame, inertial=None))
+        part = frame.inertial
+        assert part is not None
+        if k == 1:
+            odometry.add_inertial(replace(part, timestamps=part.timestamps + 5000))
+        odometry.add_inertial(part)
+        kept = odometry.inertial.estimator.stream.samples()
+        assert kept is not None and np.isin(part.timestamps, kept.timestamps).all()
+    assert np.isin(images[2].inertial.timestamps, kept.timestamps).all()
+
+
+def test_samples_that_do_not_meet_the_images_are_told() -> None:
+    odometry = tracker()
+    for frame in with_samples(frames(28)):
+        part = frame.inertial
+        assert part is not None
+        odometry.track(replace(frame, inertial=replace(part, timestamps=part.timestamps + 100)))
+    told = odometry.finish().info["inertial"]["reason"]
+    assert told.startswith("too few samples: they are from 100.") or told.startswith(
+        "too few samples: they are from 99."
+    )
+    assert "images from 0." in told
 
 
 def test_nodes_stand_on_either_side_of_a_break() -> None:

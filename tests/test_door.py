@@ -1,8 +1,14 @@
 """The public names of the package."""
 
+import doctest
+import inspect
 import subprocess
 import sys
 from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
 
 import dvo
 
@@ -54,3 +60,19 @@ def test_importing_the_package_imports_nothing_heavy():
 
 def test_types_are_announced():
     assert (Path(dvo.__file__).parent / "py.typed").is_file()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "Camera", "ClipDataset", "DvoError", "Estimate", "Frame", "LiveFrames", "Odometry", "Result", "TrackerConfig",
+        "Trajectory", "base_trajectory", "bundle_adjust", "evaluate", "load_model", "stream",
+    ],
+)  # fmt: skip
+def test_example_runs_by_itself(name):
+    """With dvo, NumPy and torch imported, and no recording: as a reader would paste it."""
+    names = {"dvo": dvo, "np": np, "torch": torch}
+    example = doctest.DocTestParser().get_doctest(inspect.getdoc(getattr(dvo, name)), names, name, None, None)
+    said: list[str] = []
+    failed, tried = doctest.DocTestRunner().run(example, out=said.append)
+    assert tried and not failed, "".join(said)

@@ -20,7 +20,7 @@ class DvoError(Exception):
     have no user names, passwords and tokens, and characters that would steer a terminal are escapes.
 
     Example:
-        >>> str(DvoError("no such file", file="calib.txt", field="--calib", remedy="give a calibration file"))
+        >>> str(dvo.DvoError("no such file", file="calib.txt", field="--calib", remedy="give a calibration file"))
         'calib.txt: --calib: no such file. Give a calibration file.'
     """
 

@@ -118,7 +118,8 @@ def base_trajectory(trajectory: Trajectory, T_base_camera: np.ndarray) -> Trajec
     Example:
         >>> turn = np.array([[0.0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 1, 0, 0]])  # about the y axis of the camera
         >>> lever = np.array([0.0, 0, 1, 0, 0, 0, 1])  # the camera is one metre ahead of the base
-        >>> base_trajectory(Trajectory(np.array([0.0, 0.1]), turn), lever).positions[1].tolist()
+        >>> trajectory = dvo.Trajectory(np.array([0.0, 0.1]), turn)
+        >>> dvo.base_trajectory(trajectory, lever).positions[1].tolist()
         [0.0, 0.0, 2.0]
     """
     pose = pose_of_numbers(T_base_camera)

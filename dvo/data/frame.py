@@ -102,11 +102,9 @@ class Frame:
             time since the frame before it.
 
     Example:
-        >>> import numpy as np
-        >>> from dvo.data import Frame
-        >>> from dvo.geometry.camera import Camera
-        >>> camera = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
-        >>> frame = Frame(0, 0.0, np.zeros((48, 64, 3), np.uint8), camera, depth=np.ones((48, 64), np.float32))
+        >>> camera = dvo.Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
+        >>> image, depth = np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32)
+        >>> frame = dvo.Frame(0, 0.0, image, camera, depth=depth)
         >>> frame.depth.shape, frame.right
         ((48, 64), None)
     """

@@ -30,9 +30,8 @@ class Trajectory:
         ValueError: shapes that do not match.
 
     Example:
-        >>> import numpy as np
         >>> poses = np.array([[0, 0, 0, 0, 0, 0, 1.0], [0, 0, 2, 0, 0, 0, 1]])
-        >>> trajectory = Trajectory(np.array([0.0, 0.5]), poses)
+        >>> trajectory = dvo.Trajectory(np.array([0.0, 0.5]), poses)
         >>> len(trajectory), trajectory.path_length
         (2, 2.0)
     """

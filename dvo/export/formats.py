@@ -67,7 +67,7 @@ def export_map(
     Example:
         >>> odometry = dvo.load("small")
         >>> run = dvo.run(odometry, dvo.open("video.mp4", calib="calib.txt"))
-        >>> print(dvo.export_map(odometry, "video-colmap"))
+        >>> written = dvo.export_map(odometry, "video-colmap")
     """
     from dvo.export.reconstruction import longest_segment
     from dvo.map.keyframe_graph import KeyframeGraph

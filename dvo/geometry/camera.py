@@ -38,7 +38,7 @@ class Camera:
             coefficients that it does not have, or a readout outside of 0 to 1 s.
 
     Example:
-        >>> camera = Camera(500.0, 500.0, 319.5, 239.5, 640, 480)
+        >>> camera = dvo.Camera(500.0, 500.0, 319.5, 239.5, 640, 480)
         >>> camera.resized(320, 240).intrinsics.tolist()
         [250.0, 250.0, 159.5, 119.5]
     """
@@ -142,6 +142,9 @@ class Camera:
 
         Args:
             width, height: new size in pixels.
+
+        Returns:
+            The camera of the resampled image.
         """
         sx, sy = width / self.width, height / self.height
         return replace(
@@ -164,6 +167,9 @@ class Camera:
         Args:
             left, top: column and row of the window's first pixel.
             width, height: size of the window in pixels.
+
+        Returns:
+            The camera of the window.
 
         Raises:
             DvoError: the principal point lies outside the window.

@@ -215,7 +215,7 @@ def evaluate(
         >>> poses_wc = np.tile([0.0, 0, 0, 0, 0, 0, 1], (4, 1))
         >>> poses_wc[:, :3] = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1]]
         >>> half = poses_wc * [0.5, 0.5, 0.5, 1, 1, 1, 1]
-        >>> found = evaluate(Trajectory(times, half), Trajectory(times, poses_wc), align="sim3")
+        >>> found = dvo.evaluate(dvo.Trajectory(times, half), dvo.Trajectory(times, poses_wc), align="sim3")
         >>> round(found.ate_rmse, 6), round(found.scale, 6)
         (0.0, 2.0)
     """

@@ -253,8 +253,13 @@ def load_model(name_or_file: str | Path = "small", device: torch.device | str = 
         name_or_file: shipped weights by name, or a safetensors file.
         device: where to put the network.
 
+    Returns:
+        The network, in evaluation mode; its class is that of the architecture in the file
+        (:class:`dvo.models.patch_vo.PatchVO` of ``small``).
+
     Raises:
-        DvoError: see :func:`load_weights`.
+        DvoError: no such file; not safetensors; an architecture that is not registered; tensors that are missing, of
+            the wrong shape, or not finite; a forked process.
 
     Example:
         >>> sum(parameter.numel() for parameter in dvo.load_model("small").parameters())

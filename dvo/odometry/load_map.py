@@ -69,7 +69,7 @@ def load_map(
     Example:
         >>> odometry = dvo.load("small")
         >>> for frame in dvo.open("monday.mp4", calib="calib.txt"):
-        ...     odometry.track(frame)
+        ...     estimate = odometry.track(frame)
         >>> odometry.save("office.dvo")
         >>> odometry = dvo.load_map("office.dvo")  # in another process, on another day
         >>> result = dvo.run(odometry, dvo.open("tuesday.mp4", calib="calib.txt")).result

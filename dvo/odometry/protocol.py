@@ -20,7 +20,14 @@ from dvo.odometry.quality import Quality
 
 
 class Status(StrEnum):
-    """State of the tracker after a frame."""
+    """State of the tracker after a frame; a string, so that ``status == "tracking"`` works.
+
+    Attributes:
+        INITIALISING: ``initialising``, the camera has not moved enough for a first pose.
+        TRACKING: ``tracking``, the frame has a pose that its image supports.
+        LOST: ``lost``, the image supports no pose. The result may have one all the same, if a later frame helps.
+        INERTIAL: ``inertial``, the image supports no pose, and inertial samples alone predict it.
+    """
 
     INITIALISING = "initialising"
     TRACKING = "tracking"
@@ -90,6 +97,13 @@ class Estimate:
         inertial: velocity, biases and more, once they are known (``aligned``).
 
     ``confidence``, ``covariance`` and ``reference`` may be functions, which are called when the value is first read.
+
+    Example:
+        >>> estimate = dvo.Estimate(0.5, np.array([1.0, 2, 3, 0, 0, 0, 1]), dvo.Status.TRACKING)
+        >>> estimate
+        Estimate(0.500 s, tracking, x y z [1. 2. 3.])
+        >>> estimate.matrix[:3, 3].tolist(), estimate.covariance
+        ([1.0, 2.0, 3.0], None)
     """
 
     timestamp: float
@@ -137,7 +151,7 @@ class SparseMap:
     """Coloured points in the world frame of the trajectory.
 
     Attributes:
-        points: ``(M, 3)`` float32.
+        points: ``(M, 3)`` float32, in the unit of the trajectory.
         colors: ``(M, 3)`` uint8 RGB.
     """
 
@@ -216,6 +230,8 @@ class Break:
 class Result:
     """Result for a sequence, available after the last frame.
 
+    Positions and points are up to scale, unless ``metric`` is True.
+
     Attributes:
         trajectory: camera-to-world pose of every tracked frame of the longest segment, with those that share its world,
             frames before the initialisation included; lost frames have no row. In a map, of the segments that share its
@@ -224,12 +240,22 @@ class Result:
         frames_read: number of input frames.
         frames_lost: number of input frames without a row in any segment.
         inertial: timestamps of the rows that are predicted from inertial samples alone.
-        info: JSON-able metadata for run.json: working resolution, intrinsics, number of keyframes.
+        info: JSON-able metadata for run.json: working resolution, intrinsics, number of keyframes, loops, scale.
         segments: all segments in order of time; given none, the trajectory is the only one.
         breaks: intervals without poses, and changes of segment, in order of time.
         depth: depth maps of the keyframes of all segments, in order of time; empty for systems without them.
-        quality: what tells if the result can be trusted, with the verdict; None from systems that do not judge
-            themselves, and of a map without a new recording.
+        quality: whether the result can be trusted, a :class:`dvo.odometry.quality.Quality` with ``verdict`` (``good``,
+            ``doubtful`` or ``failed``), ``reason`` and ``remedy``; None from systems that do not judge themselves, and
+            of a map without a new recording.
+
+    Example:
+        >>> poses_wc = np.array([[0.0, 0, 0, 0, 0, 0, 1], [0, 0, 1, 0, 0, 0, 1]])
+        >>> trajectory = dvo.Trajectory(np.array([0.0, 0.1]), poses_wc)
+        >>> result = dvo.Result(trajectory, dvo.SparseMap(), frames_read=3, frames_lost=1)
+        >>> result
+        Result(2 of 3 frames tracked, 1 segment, 0 map points)
+        >>> len(result.segments), result.metric, result.quality
+        (1, False, None)
     """
 
     trajectory: Trajectory
@@ -302,13 +328,14 @@ class Odometry(Protocol):
         ...     name = "still"
         ...     def __init__(self) -> None:
         ...         self.times: list[float] = []
-        ...     def track(self, frame: Frame) -> Estimate:
+        ...     def track(self, frame: dvo.Frame) -> dvo.Estimate:
         ...         self.times.append(frame.timestamp)
-        ...         return Estimate(frame.timestamp, np.array([0.0, 0, 0, 0, 0, 0, 1]), Status.TRACKING)
-        ...     def finish(self) -> Result:
+        ...         return dvo.Estimate(frame.timestamp, np.array([0.0, 0, 0, 0, 0, 0, 1]), dvo.Status.TRACKING)
+        ...     def finish(self) -> dvo.Result:
         ...         poses_wc = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(self.times), 1))
-        ...         return Result(Trajectory(np.array(self.times), poses_wc), SparseMap(), len(self.times), 0)
-        >>> isinstance(Still(), Odometry)
+        ...         trajectory = dvo.Trajectory(np.array(self.times), poses_wc)
+        ...         return dvo.Result(trajectory, dvo.SparseMap(), len(self.times), 0)
+        >>> isinstance(Still(), dvo.Odometry)
         True
     """
 
@@ -321,7 +348,11 @@ class Odometry(Protocol):
             frame: of the same size as the first, with a later timestamp than the one before.
 
         Returns:
-            Pose of the frame and state of the tracker.
+            Pose of the frame, if there is one, and state of the tracker.
+
+        Raises:
+            DvoError: a frame that cannot be tracked, such as one of another size or an earlier time, or a finished
+                odometry; the odometry stays as it was.
         """
         ...
 

@@ -88,15 +88,14 @@ def run(
             (:mod:`dvo.session.second_run`).
 
     Returns:
-        The result with its timings. Poses are ``T_wc``.
+        The record of the run: its ``result``, warnings and wall times. Poses are ``T_wc``.
 
     Raises:
         DvoError: a stride below 1, or a source without frames; with ``strict``, any error of the source or odometry.
 
     Example:
-        >>> done = run(dvo.load("small"), dvo.open("video.mp4", calib="calib.txt"))  # doctest: +SKIP
-        >>> len(done.result.trajectory)  # doctest: +SKIP
-        1200
+        >>> done = dvo.run(dvo.load("small"), dvo.open("video.mp4", calib="calib.txt"))
+        >>> trajectory, verdict = done.result.trajectory, done.result.quality.verdict
     """
     if stride < 1:
         raise DvoError(f"must be 1 or more, got {stride}", field="stride", remedy="give a whole number of frames")

@@ -24,7 +24,11 @@ class ClipDataset(Dataset[dict[str, Tensor]]):
         options: of :func:`dvo.synth.clip.make_clip`.
 
     Example:
-        >>> loader = DataLoader(ClipDataset(seed=0, length=1000, frames=8), batch_size=4, num_workers=2)
+        >>> from torch.utils.data import DataLoader
+        >>> clips = dvo.ClipDataset(seed=0, length=4, frames=5, height=48, width=64)
+        >>> batch = next(iter(DataLoader(clips, batch_size=2)))
+        >>> batch["images"].shape, batch["poses_cw"].shape
+        (torch.Size([2, 5, 3, 48, 64]), torch.Size([2, 5, 7]))
     """
 
     def __init__(self, seed: int, length: int, *, start: int = 0, **options: Any) -> None:

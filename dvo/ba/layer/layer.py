@@ -100,11 +100,17 @@ def bundle_adjust(
             ``plan`` of other edges. Forward-mode dual numbers outside ``torch.func``.
 
     Example:
-        >>> from dvo.ba.layer.layer import BAOptions, bundle_adjust
-        >>> result = bundle_adjust(poses_cw, patches, intrinsics, targets, weights, ii, jj, kk,
-        ...                        BAOptions(iterations=4, bounds=(160, 120)))
-        >>> loss = pose_loss(result.poses_cw, true_poses_cw)
-        >>> loss.backward()
+        Two frames, and forty patches of the first that the second sees a pixel and a half further right and down:
+
+        >>> k = torch.arange(40)
+        >>> patches = torch.rand(1, 40, 3, 1, 1) * torch.tensor([160, 120, 1.0]).view(3, 1, 1)  # x, y, inverse depth
+        >>> targets = (patches[:, :, :2, 0, 0] + 1.5).requires_grad_()
+        >>> intrinsics, weights = torch.tensor([[[200.0, 200, 80, 60]] * 2]), torch.ones(1, 40, 2)
+        >>> poses, options = dvo.se3.identity(1, 2), dvo.BAOptions(iterations=4, bounds=(160, 120))
+        >>> result = dvo.bundle_adjust(poses, patches, intrinsics, targets, weights, 0 * k, 0 * k + 1, k, options)
+        >>> result.poses_cw[0, 1, :3].norm().backward()
+        >>> targets.grad.shape
+        torch.Size([1, 40, 2])
     """
     if not isinstance(options, BAOptions):
         raise DvoError(f"is {shown(options)}", field="options", remedy="give a BAOptions object")

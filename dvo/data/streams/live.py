@@ -214,7 +214,7 @@ class LiveFrames(Generic[T]):
         DvoError: a queue of less than one element.
 
     Example:
-        >>> live = LiveFrames(iter(range(5)), drop=False)
+        >>> live = dvo.LiveFrames(iter(range(5)), drop=False)
         >>> list(live), live.counts
         ([0, 1, 2, 3, 4], StreamCounts(received=5, dropped=0))
     """

@@ -155,10 +155,8 @@ def stream(
             camera's size or cannot be converted, or that has no time.
 
     Example:
-        >>> import numpy as np
-        >>> from dvo.geometry.camera import Camera
         >>> images = (np.full((48, 64, 3), 10 * i, np.uint8) for i in range(3))
-        >>> frames = stream(images, Camera(50.0, 50.0, 31.5, 23.5, 64, 48), fps=10)
+        >>> frames = dvo.stream(images, dvo.Camera(50.0, 50.0, 31.5, 23.5, 64, 48), fps=10)
         >>> [frame.timestamp for frame in frames]
         [0.0, 0.1, 0.2]
     """

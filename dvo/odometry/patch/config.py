@@ -140,7 +140,7 @@ class TrackerConfig:
         DvoError: a value of the wrong type or out of range, with the name of the setting.
 
     Example:
-        >>> config = TrackerConfig(patches=48, optimisation=10)
+        >>> config = dvo.TrackerConfig(patches=48, optimisation=10)
         >>> odometry = dvo.load("small", config=config)
     """
 

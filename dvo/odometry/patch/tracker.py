@@ -264,7 +264,7 @@ class PatchOdometry:
 
     @torch.inference_mode()
     def finish(self) -> Result:
-        """Refine the last window and archive it. Frames are refused afterwards; a second call gives the same result.
+        """Solve for all frames at once, loops included. Frames are refused afterwards; a second call gives the same.
 
         Returns:
             Trajectories ``T_wc`` of all segments and the sparse map of the longest, each in the world of its first

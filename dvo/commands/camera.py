@@ -19,6 +19,7 @@ from dvo.odometry.calibration.camera_estimate import SelfCalibration
 from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Odometry
 from dvo.session.results import CALIBRATION, files_of_run
+from dvo.session.second_run import can_be_read_again
 
 
 def with_calibration(
@@ -27,7 +28,7 @@ def with_calibration(
     """Find the focal length of a source that was opened with a guess, print it and write it into a calibration file.
 
     Args:
-        source: to track; one with a calibration is returned as it is.
+        source: to track; one with a calibration, or that can be read once, is returned as it is.
         odometry: that will track it; if it keeps no measurements, the weights ``small`` find the focal length.
         arguments: of the command line.
         device: of all computation.
@@ -43,7 +44,7 @@ def with_calibration(
     """
     found, file, began = None, folder / CALIBRATION, time.perf_counter()
     written = False
-    if source.guess is not None:
+    if source.guess is not None and can_be_read_again(source):
         warn(_announcement(source), "note")
         weights = odometry.weights or arguments.weights if isinstance(odometry, PatchOdometry) else "small"
         with TrackingProgress(None, "calibrating") as progress:
@@ -56,7 +57,7 @@ def with_calibration(
         written = (not file.exists() or CALIBRATION in files_of_run(folder)) and found.write(file)
         if not written:
             warn(f"{file} is not a file of an earlier run, and was not replaced")
-        source = source.recalibrated(found.calibration, None if found.found else source.guess)
+        source = source.recalibrated(found.calibration, found.kept)
     elif CALIBRATION in files_of_run(folder) and not _is_given(file, source, arguments.calib):
         file.unlink(missing_ok=True)  # of an earlier run
     factor = 1 if source.reduction is None else source.reduction.factor

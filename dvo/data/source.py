@@ -138,7 +138,7 @@ class Source:
 
         Args:
             calibration: of the images as recorded.
-            guess: that its focal length still is, where the images do not tell it.
+            guess: that its focal length still is, where the images do not tell it: the verdict takes note.
 
         Raises:
             DvoError: intrinsics that do not fit the images.

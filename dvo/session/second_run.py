@@ -15,6 +15,7 @@ doubtful by itself, leaves doubt by a smaller difference.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
@@ -104,14 +105,13 @@ def compare_again(
     if np.isnan(difference) and not stopped and _has_begun(mine, kept):
         reason = "a second run, backward with another seed, finds no motion"
         return replace(mine, verdict="doubtful", reason=reason, remedy=FILM)
-    better = other is not None and other.residual < mine.residual
-    worse = other is not None and other.residual > MAX_RESIDUAL_RATIO * mine.residual
-    sure = other is not None and other.verdict == "good"
-    # Two runs that fit their measurements alike, one of them doubtful, have found two solutions.
-    most = MAX_DISPUTED if better or not (sure or worse) else MAX_DIFFERENCE
-    if sure and worse or not difference > most:  # NaN: nothing is known
-        return replace(mine, second=difference)
-    if most == MAX_DIFFERENCE:
+    ratio = math.nan if other is None or not mine.residual > 0 else other.residual / mine.residual
+    is_good = other is not None and other.verdict == "good"
+    # One that fits better, or as well and is doubtful, has found a solution that is no worse than the first.
+    rivals = ratio < 1 or (ratio <= MAX_RESIDUAL_RATIO and not is_good)
+    if is_good and ratio > MAX_RESIDUAL_RATIO or not difference > (MAX_DISPUTED if rivals else MAX_DIFFERENCE):
+        return replace(mine, second=difference)  # also where it is NaN: nothing is known
+    if not rivals:
         third, stopped = _tracked(build(2), kept, should_stop)
         if not stopped and _difference(third.trajectory, result.trajectory) <= MAX_DISPUTED:
             return replace(mine, second=difference)

@@ -127,10 +127,18 @@ def test_a_second_run_that_is_as_good_leaves_doubt_by_a_smaller_difference():
     for bend, own, residual, verdict in (
         (0.01, "good", 0.28, "good"), (0.07, "good", 0.28, "doubtful"), (0.07, "good", 0.32, "good"),
         (0.07, "doubtful", 0.32, "doubtful"), (0.07, "doubtful", 0.4, "good"), (0.01, "doubtful", 0.32, "good"),
+        (0.07, "doubtful", np.nan, "good"),
     ):  # fmt: skip
         again = Walk(bend, quality=replace(UNSURE, verdict=own, residual=residual))
         quality = ran(lambda number, again=again: again, first=first).result.quality
         assert quality.verdict == verdict and (1 < quality.second < 3 if bend > 0.05 else quality.second < 1)
+
+
+def test_a_second_run_without_a_quality_is_judged_by_its_difference():
+    """And a third one decides, as of any that is no better."""
+    for bend, third, verdict in ((0.07, 0.0, "good"), (2.0, 0.0, "good"), (2.0, 0.3, "doubtful")):
+        walks = {1: Walk(bend, quality=None), 2: Walk(third, quality=None)}
+        assert ran(walks.pop).result.quality.verdict == verdict
 
 
 def test_frames_with_equal_times_are_an_error_of_the_library_or_none():

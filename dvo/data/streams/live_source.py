@@ -18,7 +18,7 @@ import numpy as np
 from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, StereoRig
-from dvo.data.calibration.focal_guess import guess_from_angle
+from dvo.data.calibration.focal_guess import FocalGuess, guess_from_angle
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.stamps import checked_rate
 from dvo.data.images.fields import INTERLACED_STREAM, FieldTest
@@ -248,18 +248,19 @@ def open_stream(
     try:
         first = recording.first(timeout)
         height, width = first.image.shape[:2]
-        doubts = calib.doubts(width, height) if calib else [_assumption(width, height)]
-        camera = (calib or guess_from_angle(width, height).calibration).camera(width, height)
+        assumed = guess_from_angle(width, height)
+        doubts = calib.doubts(width, height) if calib else [_assumption(assumed)]
+        camera = (calib or assumed.calibration).camera(width, height)
         masks = None if mask is None else open_masks(Path(mask), recording, (width, height), mask_invert)
         selection = Selection(interval, stride)
-        return LiveSource(recording, Reading(camera, selection, undistort=undistort, masks=masks, doubts=tuple(doubts)))
+        reading = Reading(camera, selection, undistort=undistort, masks=masks, doubts=tuple(doubts))
+        return LiveSource(recording, reading if calib else replace(reading, guess=assumed))
     except BaseException:
         recording.live.close()
         raise
 
 
-def _assumption(width: int, height: int) -> str:
-    guess = guess_from_angle(width, height)
+def _assumption(guess: FocalGuess) -> str:
     return (
         f"no calibration: assuming the usual angle of view, a focal length of {guess.focal:.0f} px; it can be found in "
         "a recorded clip (dvo run CLIP), which writes a calib.txt for --calib"

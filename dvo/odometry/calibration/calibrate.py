@@ -136,7 +136,7 @@ def calibrate(
         >>> found = dvo.calibrate(source)
         >>> print(found)
         focal length 520 +- 16 px (self-calibrated from 60 frames)
-        >>> run = dvo.run(dvo.load("small"), source.recalibrated(found.calibration))
+        >>> run = dvo.run(dvo.load("small"), source.recalibrated(found.calibration, found.kept))
     """
     limit = 8 * options.frames  # with those that are left out or lost
     kept = tee(frames, 1)[0] if isinstance(frames, Iterator) else None

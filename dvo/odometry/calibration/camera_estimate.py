@@ -55,6 +55,11 @@ class SelfCalibration:
         return self.source == SELF_CALIBRATED
 
     @property
+    def kept(self) -> FocalGuess | None:
+        """Guess that was kept, for :meth:`dvo.data.source.Source.recalibrated`; None if a focal length was found."""
+        return None if self.found else self.guess
+
+    @property
     def calibration(self) -> Calibration:
         """Square pixels, the principal point at the centre and no distortion, or what was found of them."""
         return simple_camera(self.focal, self.aside, self.bend, self.width, self.height)

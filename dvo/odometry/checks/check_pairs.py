@@ -31,7 +31,6 @@ WINDOW = (15, 15)
 RETURN = 0.4
 """Largest distance of a corner from where it was, followed forward and back, pixels."""
 
-
 _ROUNDS, _NOISE = 20, 0.05  # of the fit of a similarity, and of a corner, pixels
 
 

@@ -30,6 +30,8 @@ ROLLING_SHARE = 0.5
 """Share that counts of what shifts explain under a rolling shutter, whose correction for corners is approximate."""
 STANDING = 0.1
 """Speed over the median one below which a camera stands."""
+MOST_RELIEFS = 32
+"""Pairs whose relief is measured, evenly over the sequence."""
 JUMP = 6.0
 """Length of a step over the longer one of the steps before and after, and over the median, of a jump."""
 
@@ -85,7 +87,8 @@ def measure_quality(
         agreed = float((distances < NEAR_LINE).mean())
         quality = replace(quality, checks=len(pairs), deviation=deviation, check=agreed)
         quality = replace(quality, crop=_shift_gain(graph, placed, shutter, stride))
-        reliefs = [value for pair, *poses in placed if not math.isnan(value := relief(pair, *poses))]
+        some = placed[:: math.ceil(len(placed) / MOST_RELIEFS)]
+        reliefs = [value for pair, *poses in some if not math.isnan(value := relief(pair, *poses))]
         quality = replace(quality, relief=float(np.median(reliefs)) if reliefs else math.nan)
     quality = replace(quality, still=_still(graph, checks))
     verdict, reason, remedy = judge(quality, result.frames_read, cause)

@@ -137,7 +137,7 @@ def carry_out(task: Task) -> Run:
         if task.video.calib is None:
             begun = time.process_time()
             found = dvo.calibrate(source, seed=task.seed)
-            source = source.recalibrated(found.calibration, None if found.found else source.guess)
+            source = source.recalibrated(found.calibration, found.kept)
             seconds["calibrating"] = time.process_time() - begun
         frames: Any = source
         if task.backward:

@@ -161,7 +161,7 @@ def test_a_converter_of_analogue_video(camera, make, interlaced):
 
 def test_without_a_calibration_the_angle_of_view_is_assumed(camera):
     source = dvo.open("webcam:0", guess=True)
-    assert source.camera.fx == pytest.approx(32 / math.tan(math.radians(32))) and source.guess is None
+    assert source.camera.fx == pytest.approx(32 / math.tan(math.radians(32))) and source.guess.source == "prior"
     assert "no calibration" in source.warnings[0] and "51 px" in source.warnings[0]
     source.close()
     assert camera.last.released

@@ -225,6 +225,7 @@ def test_a_clip_that_does_not_tell_goes_on(clip, monkeypatch, told_at):
     first = {20: 20, 40: 40, None: 40}[told_at]
     assert tracked[:first] == [(k, 160) for k in range(first)]
     assert found.found == (told_at is not None) and (len(tracked) == first) == (told_at is None)
+    assert found.kept == (None if found.found else found.guess)
     assert all(index == k and focal == 200 for k, (index, focal) in enumerate(tracked[first:]))
 
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dvo.geometry import se3
@@ -17,6 +17,7 @@ from dvo.odometry.checks.check_pairs import (
     CheckPairs,
     epipolar_distances,
     followed,
+    median_displacement,
     relief,
 )
 
@@ -135,6 +136,7 @@ def test_corners_across_the_lines_of_a_motion_to_the_side():
     np.testing.assert_allclose(epipolar_distances(pair, first, second), 9 / np.sqrt(2))
 
 
+@example(turn=0.15, zoom=1.05, longer=4.0)  # far above the least displacement
 @given(turn=st.floats(-0.15, 0.15), zoom=st.floats(0.95, 1.05), longer=st.floats(4.0, 8.0))
 @settings(max_examples=20, deadline=None)
 def test_a_turn_and_a_zoom_on_a_tripod_leave_no_relief(turn, zoom, longer):
@@ -148,7 +150,8 @@ def test_a_turn_and_a_zoom_on_a_tripod_leave_no_relief(turn, zoom, longer):
     points[:12, 2:] += rng.uniform(-30, 30, (12, 2))  # what moves before it
     still, moved = np.array([0.0, 0, 0, 0, 0, 0, 1]), np.array([0.1, 0, 0, 0, 0, 0, 1])
     found = relief(CheckPair(0, 4, points, K), still, moved)
-    assert np.isnan(found) or found < 0.03
+    is_seen = median_displacement(points) >= DISPLACEMENTS[0]
+    assert found < 0.03 if is_seen else np.isnan(found)
 
 
 def test_a_scene_has_relief():

@@ -90,8 +90,12 @@ def build_parser() -> argparse.ArgumentParser:
     summary.set_defaults(run="dvo.commands.summary:summary")
 
     evaluate = commands.add_parser("evaluate", help="compare trajectories with a reference, without a run")
-    evaluate.add_argument("reference", metavar="REFERENCE", help="ground truth: TUM file, or a results folder")
-    evaluate.add_argument("estimates", metavar="ESTIMATE", nargs="+", help="TUM files, or results folders")
+    evaluate.add_argument(
+        "reference", metavar="REFERENCE", help="ground truth (TUM, KITTI, EuRoC or TartanAir), or a results folder"
+    )
+    evaluate.add_argument(
+        "estimates", metavar="ESTIMATE", nargs="+", help="trajectories in these formats, or results folders"
+    )
     evaluate.add_argument(
         "--align", choices=("sim3", "se3", "scale", "none"), default="sim3", help="fitted first (default: %(default)s)"
     )

@@ -15,8 +15,8 @@ from eval.execution.plan import AXES, LOOPS, PAGE, RESULTS, TABLE, Plan, read_ma
 from eval.execution.runner import predict_all
 from eval.reporting.report import write_report, write_tables
 from eval.scoring.score import score_all
-from eval.suites.selection import config_names, folder_of_data, is_rendered, load_suites, settle
-from eval.suites.suite import read_suites
+from eval.suites.selection import folder_of_data, is_rendered, load_suites, settle
+from eval.suites.suite import read_suites, suite_names
 from eval.systems.registry import DEFAULT, list_systems
 
 
@@ -135,7 +135,7 @@ def show_list(given: argparse.Namespace) -> None:
         data = None
         print_line()
         print_line(f"Suites ({error})")
-    for name in config_names():
+    for name in suite_names():
         try:
             suites = load_suites([name])
         except DvoError as error:

@@ -31,8 +31,8 @@ from dvo.core.errors import DvoError
 from dvo.core.processes import run_limited
 from dvo.core.threads import process_environment
 from eval.benchmarks.timed_run import KINDS, Job, Timed
-from eval.suites.selection import config_names, folder_of_data, load_suites, settle, suite_of_folder
-from eval.suites.suite import ROOT, Suite
+from eval.suites.selection import folder_of_data, load_suites, settle, suite_of_folder
+from eval.suites.suite import ROOT, Suite, suite_names
 from eval.suites.suite import Sequence as Recording
 from eval.systems.registry import find_system
 
@@ -54,7 +54,7 @@ def find_sequences(wanted: Sequence[str]) -> list[tuple[Suite, Recording]]:
         DvoError: no such sequence.
     """
     known: dict[str, tuple[Suite, Recording]] = {}
-    for suite in load_suites(["validation", *(name for name in config_names() if name != "validation")]):
+    for suite in load_suites(list(dict.fromkeys(["validation", *suite_names()]))):
         known = {sequence.name: (suite, sequence) for sequence in suite.sequences} | known
     found = []
     for name in dict.fromkeys(wanted):

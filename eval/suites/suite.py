@@ -152,6 +152,12 @@ def read_suites(text: str) -> list[Suite]:
     return [read_suite(text)]
 
 
+def suite_names() -> list[str]:
+    """Names of all suites for :func:`read_suites`: files of configs/eval, for a rendered group those of its axes."""
+    files = sorted(file.stem for file in SUITES.glob("*.yaml"))
+    return [name for file in files for name in (_rendered(file).axes if file in RENDERED else [file])]
+
+
 def read_suite(name_or_file: str | Path) -> Suite:
     """A suite by name (configs/eval/NAME.yaml) or from a file.
 
@@ -165,8 +171,7 @@ def read_suite(name_or_file: str | Path) -> Suite:
     if path.suffix not in (".yaml", ".yml"):
         path = SUITES / f"{name_or_file}.yaml"
     if not path.is_file():
-        axes = [axis for group in RENDERED for axis in _rendered(group).axes]
-        names = ", ".join([*sorted(file.stem for file in SUITES.glob("*.yaml")), *axes])
+        names = ", ".join(dict.fromkeys([*suite_names(), *RENDERED]))
         raise DvoError("no such suite", file=path, field="--suite", remedy=f"give a file, or one of: {names}")
     return _suite(read_yaml(path), path)
 

@@ -103,6 +103,7 @@ def test_list(tmp_path, monkeypatch, capsys):
     assert main(["list"]) == 0
     told = capsys.readouterr().out
     assert "klt-pnp        MIT        available" in told and "MH_01 " in told
+    assert "\n  inertial " in told and "\n  inertial_dark " in told  # a group with the name of its first axis
     assert f"missing: {tmp_path / 'MH_01_easy'}" in told and "data: https://www.cvlibs.net" in told
     assert main(["--list"]) == 0 and capsys.readouterr().out == told
 

@@ -22,12 +22,14 @@ from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.synth.sequence import make_sequence
 
 STAGES = {
+    "alignment without the network": ("frame_alignment.py", "align"),
+    "pixels fixed to the image": ("fixed_pixels.py", "see"),
     "encoder and patches": ("front_end.py", "observe"),
     "graph index": ("edges.py", "build_graph"),
     "reprojection": ("projection.py", "reproject"),
     "correlation": ("edge_correlation.py", "lookup"),
     "update operator": ("update.py", "forward"),
-    "bundle adjustment": ("layer.py", "adjust_dense"),
+    "bundle adjustment": ("layer.py", "dense_solution"),
     "keyframes": ("tracker.py", "_reduce"),
 }
 

@@ -26,6 +26,7 @@ from dvo.core.command_line import OneLineParser
 from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.nets.alignment.alignment import align_patches
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation
+from dvo.nets.patch.encoder import activate
 
 Call = Callable[[], Tensor]
 CPU = torch.device("cpu")
@@ -66,6 +67,12 @@ def alignment(generator: torch.Generator, device: torch.device) -> tuple[str, Ca
     return f"{edges} edges", lambda: align_patches(images, source, source, centres, start, warps).positions
 
 
+def normalisation(generator: torch.Generator, device: torch.device) -> tuple[str, Call]:
+    """Normalisation and rectifier behind a convolution of the encoder, at half of 320x240."""
+    x, skip = (torch.randn(1, 32, 120, 160, generator=generator).to(device) for _ in range(2))
+    return "32 channels, 160x120", lambda: activate(x.clone(), torch.nn.InstanceNorm2d(32), skip)
+
+
 def window(generator: torch.Generator, device: torch.device) -> PatchProblem:
     """Window of a tracker, a batch of one."""
     frames, per_frame = 9, 24
@@ -102,6 +109,7 @@ def small_graph(generator: torch.Generator, device: torch.device) -> tuple[str, 
 KERNELS: dict[str, Callable[[torch.Generator, torch.device], tuple[str, Call]]] = {
     "correlation, level 1": lambda generator, device: edge_correlation(generator, device, 1),
     "correlation, level 4": lambda generator, device: edge_correlation(generator, device, 4),
+    "normalisation": normalisation,
     "alignment": alignment,
     "window solver": window_solver,
     "small graph": small_graph,

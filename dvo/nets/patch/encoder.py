@@ -10,11 +10,32 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from dvo.core.kernels import use_kernels
+
 _NOISE = 1e-4  # variance of an image that is no contrast, in units of normalised images (about a grey level)
 
 
 def _norm(channels: int, kind: str) -> nn.Module:
     return nn.InstanceNorm2d(channels) if kind == "instance" else nn.Identity()
+
+
+def activate(x: Float[Tensor, "n c h w"], norm: nn.Module, skip: Tensor | None = None) -> Float[Tensor, "n c h w"]:
+    """Normalise and rectify the output of a convolution; add a skip, and rectify the sum.
+
+    Args:
+        x: is overwritten where a kernel computes.
+        norm: :class:`torch.nn.InstanceNorm2d` without parameters, or the identity.
+        skip: of the same shape; None: none.
+    """
+    given = (x,) if skip is None else (x, skip)
+    if isinstance(norm, nn.InstanceNorm2d) and use_kernels(*given) and all(one.is_contiguous() for one in given):
+        from dvo.nets.patch.encoder_kernels import normalise
+
+        rows = x.flatten(0, 1).flatten(1)
+        normalise(rows.numpy(), norm.eps, rows[:0].numpy() if skip is None else skip.reshape(rows.shape).numpy())
+        return x
+    x = F.relu(norm(x))
+    return x if skip is None else F.relu(skip + x)
 
 
 class ResidualBlock(nn.Module):
@@ -45,9 +66,8 @@ class ResidualBlock(nn.Module):
         Returns:
             ``(n, outputs, h / stride, w / stride)``.
         """
-        y = F.relu(self.norm1(self.conv1(x)))
-        y = F.relu(self.norm2(self.conv2(y)))
-        return F.relu(self.downsample(x) + y)
+        y = activate(self.conv1(x), self.norm1)
+        return activate(self.conv2(y), self.norm2, self.downsample(x))
 
 
 class _StrideFour(nn.Module):
@@ -125,7 +145,7 @@ class Encoder(_StrideFour):
         Returns:
             Stem features, centred on image pixels ``(2u, 2v)``.
         """
-        return self.layer1(F.relu(self.norm1(self.conv1(images))))
+        return self.layer1(activate(self.conv1(images), self.norm1))
 
     def trunk(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n t h w"]:
         """See :meth:`_StrideFour.trunk`."""

@@ -5,13 +5,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from safetensors.torch import save_file
 
 from dvo.core.errors import DvoError
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import load_weights, save_weights
 from dvo.nets.patch.config import ModelConfig, preset
-from dvo.nets.patch.encoder import Encoder, LightEncoder, local_contrast, standardise_whole
+from dvo.nets.patch.encoder import Encoder, LightEncoder, activate, local_contrast, standardise_whole
 from dvo.nets.patch.patchifier import ENCODERS
 
 SIZE, PLACE = (160, 192), (20, 24)
@@ -123,3 +125,38 @@ def test_sizes_that_name_no_encoder_are_of_the_residual_one(tmp_path):
     loaded = load_weights(tmp_path / "old.safetensors")
     assert loaded.preset == "tiny" and isinstance(loaded.model.patchify.fnet, Encoder)
     assert load_weights("small").preset == "small"
+
+
+@given(
+    sizes=st.tuples(st.integers(1, 2), st.integers(1, 5), st.integers(2, 40), st.integers(1, 40)),
+    skips=st.booleans(), mean=st.floats(-50, 50), seed=st.integers(0, 99),
+)  # fmt: skip
+def test_the_kernel_normalises_and_rectifies_as_its_twin(sizes, skips, mean, seed):
+    generator = torch.Generator().manual_seed(seed)
+    x, skip = (torch.randn(sizes, generator=generator) + shift for shift in (mean, 0))
+    found = activate(x.clone(), torch.nn.InstanceNorm2d(sizes[1]), skip if skips else None)
+    exact = torch.nn.functional.instance_norm(x.double()).relu()
+    exact = (skip + exact).relu() if skips else exact
+    torch.testing.assert_close(found.double(), exact, atol=1e-4, rtol=1e-4)
+
+
+def test_the_kernel_computes_without_gradients_alone(monkeypatch):
+    encoder = Encoder(4, 8, 6, "instance")
+    images = torch.randn(1, 3, 48, 64, generator=torch.Generator().manual_seed(0))
+    recorded = encoder(images)
+    recorded.sum().backward()
+    assert encoder.conv1.weight.grad is not None and encoder.conv1.weight.grad.abs().sum() > 0
+    with torch.no_grad():
+        by_kernel = encoder(images)
+        monkeypatch.setenv("DVO_KERNELS", "torch")
+        by_twin = encoder(images)
+    torch.testing.assert_close(by_kernel, by_twin, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(recorded.detach(), by_twin, atol=1e-4, rtol=1e-4)
+
+
+def test_the_kernel_keeps_what_is_not_a_number():
+    x = torch.ones(1, 2, 4, 4)
+    x[0, 1, 2, 2] = torch.nan
+    with torch.no_grad():
+        found = activate(x, torch.nn.InstanceNorm2d(2))
+    assert found[0, 0].eq(0).all() and found[0, 1].isnan().all()

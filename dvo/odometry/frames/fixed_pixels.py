@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -215,9 +216,15 @@ def picture_motion(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
     affine, agree = cv2.estimateAffine2D(before, after, ransacReprojThreshold=1.0)
     if affine is None or int(agree.sum()) < MIN_CORNERS:
         return None
-    y, x = np.mgrid[0:height, 0:width].astype(np.float32) / 2
+    y, x = _grid(height, width)
     to_right, down = (2 * (row[0] * x + row[1] * y + row[2]) for row in affine.astype(np.float32))
     return to_right - 2 * x, down - 2 * y
+
+
+@lru_cache(maxsize=1)
+def _grid(height: int, width: int) -> np.ndarray:
+    """``(2, height, width)`` rows and columns of the pixels in an image of half the size."""
+    return np.mgrid[0:height, 0:width].astype(np.float32) / 2
 
 
 def _grey_and_gradient(image: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:

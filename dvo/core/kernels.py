@@ -38,12 +38,13 @@ def use_kernels(*tensors: Tensor, double: bool = False, adjoint: bool = False) -
 
     Returns:
         True for float32 tensors (or float64, where these are taken) on the CPU of which no derivative is recorded, by
-        autograd (unless ``adjoint``), as dual numbers or within ``torch.func``, if kernels are there and wanted.
+        autograd (unless ``adjoint``), as dual numbers or within ``torch.func``, if kernels are there and wanted; False
+        while operations are traced, for ONNX.
 
     Raises:
         DvoError: ``DVO_KERNELS`` has another value than ``numba`` or ``torch``.
     """
-    if not available() or is_transformed() or forward_ad._current_level >= 0:
+    if not available() or is_transformed() or forward_ad._current_level >= 0 or torch.jit.is_tracing():
         return False
     dtype = torch.float64 if double and any(x.dtype == torch.float64 for x in tensors) else torch.float32
     plain = all(type(x) is Tensor and x.device.type == "cpu" and x.dtype == dtype for x in tensors)

@@ -26,7 +26,7 @@ from dvo.core.command_line import OneLineParser
 from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.nets.alignment.alignment import align_patches
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation
-from dvo.nets.patch.encoder import activate
+from dvo.nets.patch.encoder import normalise
 
 Call = Callable[[], Tensor]
 CPU = torch.device("cpu")
@@ -69,8 +69,8 @@ def alignment(generator: torch.Generator, device: torch.device) -> tuple[str, Ca
 
 def normalisation(generator: torch.Generator, device: torch.device) -> tuple[str, Call]:
     """Normalisation and rectifier behind a convolution of the encoder, at half of 320x240."""
-    x, skip = (torch.randn(1, 32, 120, 160, generator=generator).to(device) for _ in range(2))
-    return "32 channels, 160x120", lambda: activate(x.clone(), torch.nn.InstanceNorm2d(32), skip)
+    x, skip = (torch.randn(1, 120, 160, 16, generator=generator).permute(0, 3, 1, 2).to(device) for _ in range(2))
+    return "16 channels, 160x120", lambda: normalise(x.clone(), torch.nn.InstanceNorm2d(16), skip=skip)
 
 
 def window(generator: torch.Generator, device: torch.device) -> PatchProblem:

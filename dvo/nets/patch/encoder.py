@@ -19,23 +19,31 @@ def _norm(channels: int, kind: str) -> nn.Module:
     return nn.InstanceNorm2d(channels) if kind == "instance" else nn.Identity()
 
 
-def activate(x: Float[Tensor, "n c h w"], norm: nn.Module, skip: Tensor | None = None) -> Float[Tensor, "n c h w"]:
-    """Normalise and rectify the output of a convolution; add a skip, and rectify the sum.
+def normalise(
+    x: Float[Tensor, "n c h w"], norm: nn.Module, rectified: bool = True, skip: Tensor | None = None
+) -> Float[Tensor, "n c h w"]:
+    """Normalise the output of a convolution; add a skip, and rectify the sum.
 
     Args:
-        x: is overwritten where a kernel computes.
+        x: is overwritten where a kernel computes, which takes channels that are last in memory.
         norm: :class:`torch.nn.InstanceNorm2d` without parameters, or the identity.
+        rectified: with a rectifier behind the normalisation.
         skip: of the same shape; None: none.
     """
     given = (x,) if skip is None else (x, skip)
-    if isinstance(norm, nn.InstanceNorm2d) and use_kernels(*given) and all(one.is_contiguous() for one in given):
-        from dvo.nets.patch.encoder_kernels import normalise
+    if isinstance(norm, nn.InstanceNorm2d) and use_kernels(*given) and all(map(_has_channels_last, given)):
+        from dvo.nets.patch import encoder_kernels
 
-        rows = x.flatten(0, 1).flatten(1)
-        normalise(rows.numpy(), norm.eps, rows[:0].numpy() if skip is None else skip.reshape(rows.shape).numpy())
+        pixels, *beside = (one.permute(0, 2, 3, 1).flatten(1, 2).numpy() for one in given)
+        encoder_kernels.normalise(pixels, norm.eps, rectified, beside[0] if beside else pixels[:0])
         return x
-    x = F.relu(norm(x))
+    x = norm(x)
+    x = F.relu(x) if rectified else x
     return x if skip is None else F.relu(skip + x)
+
+
+def _has_channels_last(x: Tensor) -> bool:
+    return x.is_contiguous(memory_format=torch.channels_last)
 
 
 class ResidualBlock(nn.Module):
@@ -66,8 +74,11 @@ class ResidualBlock(nn.Module):
         Returns:
             ``(n, outputs, h / stride, w / stride)``.
         """
-        y = activate(self.conv1(x), self.norm1)
-        return activate(self.conv2(y), self.norm2, self.downsample(x))
+        y = normalise(self.conv1(x), self.norm1)
+        if isinstance(self.downsample, nn.Sequential):
+            convolution, norm = self.downsample
+            x = normalise(convolution(x), norm, rectified=False)
+        return normalise(self.conv2(y), self.norm2, skip=x)
 
 
 class _StrideFour(nn.Module):
@@ -145,7 +156,9 @@ class Encoder(_StrideFour):
         Returns:
             Stem features, centred on image pixels ``(2u, 2v)``.
         """
-        return self.layer1(activate(self.conv1(images), self.norm1))
+        if use_kernels(images):  # convolutions keep the order, and are faster in it
+            images = images.contiguous(memory_format=torch.channels_last)
+        return self.layer1(normalise(self.conv1(images), self.norm1))
 
     def trunk(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n t h w"]:
         """See :meth:`_StrideFour.trunk`."""

@@ -1,8 +1,7 @@
-"""Kernel of :func:`dvo.nets.patch.encoder.activate`."""
+"""Kernel of :func:`dvo.nets.patch.encoder.normalise`."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -11,43 +10,53 @@ from dvo.core.compiled import compiled
 
 Array = Any
 
-_RUN = 512  # values of a sum in single precision; sums of these are in double precision
+_RUN = 64  # pixels whose sum is in single precision; sums of these are in double precision
 
 
 @compiled
-def normalise(x: Array, eps: float, skip: Array) -> None:
-    """Instance normalisation and rectifier in place, and those of a sum with a skip.
+def normalise(x: Array, eps: float, rectified: bool, skip: Array) -> None:
+    """Instance normalisation in place, perhaps with a rectifier, and the sum with a skip, rectified.
 
     Args:
-        x: ``(R, S)``, a row for each channel of each image.
+        x: ``(N, S, C)``, images, pixels and channels.
         eps: added to the variance.
-        skip: ``(R, S)``, added before a second rectifier; ``(0, S)``: none.
+        rectified: with a rectifier.
+        skip: ``(N, S, C)``, added before another rectifier; ``(0, S, C)``: none.
     """
-    rows, size = x.shape
+    images, pixels, channels = x.shape
     zero = np.float32(0)
-    for r in range(rows):
-        row = x[r]
-        total = 0.0
-        for first in range(0, size, _RUN):
-            part = zero
-            for k in range(first, min(size, first + _RUN)):
-                part += row[k]
-            total += part
-        mean = np.float32(total / size)
-        total = 0.0
-        for first in range(0, size, _RUN):
-            part = zero
-            for k in range(first, min(size, first + _RUN)):
-                part += (row[k] - mean) * (row[k] - mean)
-            total += part
-        factor = np.float32(1 / math.sqrt(total / size + eps))
+    low = zero if rectified else np.float32(-np.inf)
+    mean, factor, part = np.empty(channels, np.float32), np.empty(channels, np.float32), np.empty(channels, np.float32)
+    total = np.empty(channels, np.float64)
+    for n in range(images):
+        image = x[n]
+        mean[:] = 0
+        for squares in (False, True):
+            total[:] = 0
+            for first in range(0, pixels, _RUN):
+                part[:] = 0
+                if squares:
+                    for s in range(first, min(pixels, first + _RUN)):
+                        for c in range(channels):
+                            part[c] += (image[s, c] - mean[c]) * (image[s, c] - mean[c])
+                else:
+                    for s in range(first, min(pixels, first + _RUN)):
+                        for c in range(channels):
+                            part[c] += image[s, c]
+                for c in range(channels):
+                    total[c] += part[c]
+            for c in range(channels):
+                if squares:
+                    factor[c] = 1 / np.sqrt(total[c] / pixels + eps)
+                else:
+                    mean[c] = total[c] / pixels
+        for s in range(pixels):
+            for c in range(channels):
+                value = (image[s, c] - mean[c]) * factor[c]
+                image[s, c] = low if value < low else value  # NaN stays
         if len(skip):
-            beside = skip[r]
-            for k in range(size):
-                value = (row[k] - mean) * factor
-                value = beside[k] + (zero if value < zero else value)
-                row[k] = zero if value < zero else value
-        else:
-            for k in range(size):
-                value = (row[k] - mean) * factor
-                row[k] = zero if value < zero else value  # NaN stays
+            beside = skip[n]
+            for s in range(pixels):
+                for c in range(channels):
+                    value = beside[s, c] + image[s, c]
+                    image[s, c] = zero if value < zero else value

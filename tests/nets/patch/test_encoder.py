@@ -13,7 +13,7 @@ from dvo.core.errors import DvoError
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import load_weights, save_weights
 from dvo.nets.patch.config import ModelConfig, preset
-from dvo.nets.patch.encoder import Encoder, LightEncoder, activate, local_contrast, standardise_whole
+from dvo.nets.patch.encoder import Encoder, LightEncoder, local_contrast, normalise, standardise_whole
 from dvo.nets.patch.patchifier import ENCODERS
 
 SIZE, PLACE = (160, 192), (20, 24)
@@ -129,13 +129,15 @@ def test_sizes_that_name_no_encoder_are_of_the_residual_one(tmp_path):
 
 @given(
     sizes=st.tuples(st.integers(1, 2), st.integers(1, 5), st.integers(2, 40), st.integers(1, 40)),
-    skips=st.booleans(), mean=st.floats(-50, 50), seed=st.integers(0, 99),
+    rectified=st.booleans(), skips=st.booleans(), mean=st.floats(-50, 50), seed=st.integers(0, 99),
 )  # fmt: skip
-def test_the_kernel_normalises_and_rectifies_as_its_twin(sizes, skips, mean, seed):
+def test_the_kernel_normalises_and_rectifies_as_its_twin(sizes, rectified, skips, mean, seed):
     generator = torch.Generator().manual_seed(seed)
-    x, skip = (torch.randn(sizes, generator=generator) + shift for shift in (mean, 0))
-    found = activate(x.clone(), torch.nn.InstanceNorm2d(sizes[1]), skip if skips else None)
-    exact = torch.nn.functional.instance_norm(x.double()).relu()
+    order = {"memory_format": torch.channels_last}
+    x, skip = ((torch.randn(sizes, generator=generator) + shift).contiguous(**order) for shift in (mean, 0))
+    found = normalise(x.clone(), torch.nn.InstanceNorm2d(sizes[1]), rectified, skip if skips else None)
+    exact = torch.nn.functional.instance_norm(x.double())
+    exact = exact.relu() if rectified else exact
     exact = (skip + exact).relu() if skips else exact
     torch.testing.assert_close(found.double(), exact, atol=1e-4, rtol=1e-4)
 
@@ -155,8 +157,8 @@ def test_the_kernel_computes_without_gradients_alone(monkeypatch):
 
 
 def test_the_kernel_keeps_what_is_not_a_number():
-    x = torch.ones(1, 2, 4, 4)
+    x = torch.ones(1, 2, 4, 4).contiguous(memory_format=torch.channels_last)
     x[0, 1, 2, 2] = torch.nan
     with torch.no_grad():
-        found = activate(x, torch.nn.InstanceNorm2d(2))
+        found = normalise(x, torch.nn.InstanceNorm2d(2))
     assert found[0, 0].eq(0).all() and found[0, 1].isnan().all()

@@ -156,8 +156,8 @@ class Encoder(_StrideFour):
         Returns:
             Stem features, centred on image pixels ``(2u, 2v)``.
         """
-        if use_kernels(images):  # convolutions keep the order, and are faster in it
-            images = images.contiguous(memory_format=torch.channels_last)
+        if use_kernels(images):  # convolutions are faster in this order, and keep it if all strides are those of a copy
+            images = torch.empty_like(images, memory_format=torch.channels_last).copy_(images)
         return self.layer1(normalise(self.conv1(images), self.norm1))
 
     def trunk(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n t h w"]:

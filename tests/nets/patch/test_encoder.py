@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from safetensors.torch import save_file
 
 from dvo.core.errors import DvoError
+from dvo.core.kernels import available
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import load_weights, save_weights
 from dvo.nets.patch.config import ModelConfig, preset
@@ -162,3 +163,12 @@ def test_the_kernel_keeps_what_is_not_a_number():
     with torch.no_grad():
         found = normalise(x, torch.nn.InstanceNorm2d(2))
     assert found[0, 0].eq(0).all() and found[0, 1].isnan().all()
+
+
+@pytest.mark.skipif(not available(), reason="kernels are not wanted")
+def test_channels_stay_last_for_the_kernel():
+    """An image as a camera gives it, whose batch dimension has a stride of its own."""
+    image = torch.randint(0, 256, (48, 64, 3), dtype=torch.uint8)
+    with torch.no_grad():
+        trunk = Encoder(4, 8, 6, "instance").trunk(image.permute(2, 0, 1)[None].float())
+    assert trunk.is_contiguous(memory_format=torch.channels_last)

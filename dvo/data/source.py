@@ -54,6 +54,7 @@ class Reading:
         stages: that follow, in order.
         calibration: of the recorded images, as read; None for a stream.
         guess: of the focal length; None for a calibration.
+        given: the calibration was, or the source; False for one that was found in the images.
         masks: of the recorded images; None for none.
         depth_calibration: of depth images that are not registered to the images; None for others.
         groundtruth: camera-to-world poses; None for none.
@@ -68,6 +69,7 @@ class Reading:
     stages: tuple[Stage, ...] = ()
     calibration: Calibration | None = None
     guess: FocalGuess | None = None
+    given: bool = True
     masks: Masks | None = None
     depth_calibration: Calibration | None = None
     groundtruth: Trajectory | None = None
@@ -98,6 +100,8 @@ class Source:
         masks: of the recorded images; None for none.
         guess: of the focal length, for a source without a calibration that was opened with one, as long as nothing
             better is known; None otherwise.
+        calibrated: a calibration was given, or the source brings one; False with a guess, or one that was found in the
+            images (:meth:`recalibrated`).
         turned: degrees clockwise by which frames are turned to stand upright, as a video or EXIF data ask for.
         stride: every how many-th frame is read.
         frame_count: frames to expect, the stride taken into account; None if a video does not say. A video's header may
@@ -115,6 +119,7 @@ class Source:
         self.kind, self.path, self.turned = recording.kind, recording.path, recording.turned
         self.recorded_camera, self.groundtruth = reading.recorded_camera, reading.groundtruth
         self.calibration, self.guess, self.masks = reading.calibration, reading.guess, reading.masks
+        self.calibrated = reading.given and reading.guess is None
         self.stride, self.reduction = reading.selection.stride, reading.selection.reduction
         read = self.recorded_camera if self.reduction is None else self.reduction.camera(self.recorded_camera)
         self._undistorter = Undistorter(read) if reading.undistort and read.needs_undistortion else None
@@ -134,17 +139,17 @@ class Source:
         return type(self)(self.recording, replace(self.reading, **changes))
 
     def recalibrated(self, calibration: Calibration, guess: FocalGuess | None = None) -> Self:
-        """The same recording with another calibration.
+        """The same recording with a calibration that was found in its images; the verdict takes note.
 
         Args:
             calibration: of the images as recorded.
-            guess: that its focal length still is, where the images do not tell it: the verdict takes note.
+            guess: that its focal length still is, where the images do not tell it.
 
         Raises:
             DvoError: intrinsics that do not fit the images.
         """
         camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
-        return self.changed(recorded_camera=camera, calibration=calibration, guess=guess)
+        return self.changed(recorded_camera=camera, calibration=calibration, guess=guess, given=False)
 
     def at_recorded_size(self) -> Self:
         """The same recording, its images not reduced."""

@@ -41,6 +41,10 @@ most of what is seen, and little holds the scale."""
 LEAST_RELIEF = 0.03
 """Relief of the corners (:attr:`Quality.relief`) below which the picture moves as a whole: 0.12 to 0.99 in twelve
 recordings of cameras that move through a scene, 0.01 in one of a camera that turns and zooms on a tripod."""
+LEAST_SHIFT = 0.4
+"""Share of the corners' motion that is no turn by the poses (:attr:`Quality.shift`), where a turn explains all of it,
+below which the camera may turn in its place: 0.07 to 0.33
+in recordings and renderings of cameras that do. No motion of sixteen others was a turn to less than 0.049 of it."""
 MOST_JUMPS = 2
 """Jumps in a hundred frames."""
 
@@ -74,6 +78,9 @@ class Quality:
         still: share of the frames through which followed corners hardly move though the poses do.
         relief: how far the followed corners of a pair are from moving as a whole (shift, turn and zoom of the picture),
             over the parallax that the poses give them, median of the pairs; NaN without parallax.
+        shift: share of the motion of these corners that the poses do not take for a turn, though a turn of the camera
+            in its place, perhaps with another focal length, explains all of it; median of the pairs, NaN where none
+            does.
         jumps: number of frames between which the camera moved far more than before and after.
         fixed: share of the image that is fixed to the camera, is in no mask that was given, and was left out.
         second: difference of a second run, backward with another seed, percent of the path; NaN if there was none.
@@ -100,6 +107,7 @@ class Quality:
     checks: int = 0
     still: float = 0.0
     relief: float = float("nan")
+    shift: float = float("nan")
     jumps: int = 0
     fixed: float = 0.0
     second: float = float("nan")
@@ -170,21 +178,31 @@ def judge(quality: Quality, frames: int, cause: str = "") -> tuple[Verdict, str,
     return "good", "", ""
 
 
-def without_calibration(quality: Quality) -> Quality:
-    """Quality of a result whose focal length is a guess.
+def without_calibration(quality: Quality, guessed: bool = True) -> Quality:
+    """Quality of a result whose focal length was not given.
 
     A camera that turns or zooms on a tripod, with a lens longer than the guess, looks like one that moves before a flat
-    picture: no focal length is told, and the motion may be none.
+    picture: no focal length is told, and the motion may be none. One that turns in its place with another focal length
+    looks like one that also moves sideways, and the measurements may tell that focal length for sure.
 
     Args:
         quality: of the result.
+        guessed: the focal length is a guess; False: it was found in the images.
 
     Returns:
-        The same; doubtful where it was good and the picture moves as a whole.
+        The same; doubtful where it was good and the picture moves as a whole, or as that of a camera that turns.
     """
-    if quality.verdict != "good" or not quality.relief < LEAST_RELIEF:
+    if quality.verdict != "good":
         return quality
-    reason = (
-        "the picture moves as a whole: without a calibration a turn or a zoom looks like a motion before a flat scene"
-    )
+    if guessed and quality.relief < LEAST_RELIEF:
+        reason = (
+            "the picture moves as a whole: without a calibration a turn or a zoom looks like a motion before a flat "
+            "scene"
+        )
+    elif quality.shift < LEAST_SHIFT:
+        reason = (
+            "the picture moves as if the camera turned in its place: without a calibration that looks like a motion"
+        )
+    else:
+        return quality
     return replace(quality, verdict="doubtful", reason=reason, remedy=CALIBRATE)

@@ -135,8 +135,9 @@ def run(
     else:
         result = odometry.finish()
     feeding.seconds["finishing"] = time.perf_counter() - started
-    if result.quality is not None and getattr(source, "guess", None) is not None:
-        result = replace(result, quality=without_calibration(result.quality))
+    guessed = getattr(source, "guess", None) is not None
+    if result.quality is not None and (guessed or not getattr(source, "calibrated", True)):
+        result = replace(result, quality=without_calibration(result.quality, guessed))
     if again is not None and not interrupted and is_due(result, source):
         tell("checking")
         started = time.perf_counter()

@@ -203,6 +203,7 @@ def test_what_undistortion_cuts_of_a_fisheye_is_said_once(make):
     calib = make.text("fisheye.yaml", lens)
     source = open_source(make.images("clip", ["0.png", "1.png"]), calib=calib, fps=1)
     again = source.recalibrated(Calibration(30, 30, 31.5, 23.5, model="fisheye", coefficients=(0.0,) * 4))
+    assert not again.calibrated
     for opened in (source, again):
         list(opened)
         (said,) = (warning for warning in opened.warnings if "fisheye" in warning)

@@ -32,6 +32,8 @@ RETURN = 0.4
 """Largest distance of a corner from where it was, followed forward and back, pixels."""
 
 _ROUNDS, _NOISE = 20, 0.05  # of the fit of a similarity, and of a corner, pixels
+_TURN_ROUNDS = 8  # of the fit of a turn, whose start is near
+_STRETCH = 0.4  # logarithm of the focal length of a turn over the one that was used, at most
 
 
 @dataclass(frozen=True)
@@ -147,16 +149,65 @@ def relief(pair: CheckPair, first_cw: np.ndarray, second_cw: np.ndarray) -> floa
         Median distance from the fit, over the median length of what the rotation does not explain; NaN where that is
         less than the first of :data:`DISPLACEMENTS`.
     """
+    length = float(np.median(parallax(pair, first_cw, second_cw)))
+    if not length >= DISPLACEMENTS[0]:
+        return math.nan
+    return float(np.median(_off_similarity(pair.points.astype(np.float64)))) / length
+
+
+def parallax(pair: CheckPair, first_cw: np.ndarray, second_cw: np.ndarray) -> np.ndarray:
+    """What the rotation of the poses does not explain of the motion of the corners of a pair.
+
+    Args:
+        pair: corners.
+        first_cw, second_cw: ``(7,)`` poses ``T_cw`` of its frames.
+
+    Returns:
+        ``(N,)`` lengths, pixels.
+    """
     fx, fy, cx, cy = pair.intrinsics
     points = pair.points.astype(np.float64)
     rays = torch.from_numpy(np.column_stack([(points[:, 0] - cx) / fx, (points[:, 1] - cy) / fy, np.ones(len(points))]))
     turn = se3.relative(*(torch.as_tensor(pose, dtype=torch.float64) for pose in (first_cw, second_cw)))[3:]
     turned = so3.rotate(turn.expand(len(rays), 4), rays).numpy()
-    parallax = points[:, 2:] - turned[:, :2] / turned[:, 2:] * (fx, fy) - (cx, cy)
-    length = float(np.median(np.linalg.norm(parallax, axis=1)))
-    if not length >= DISPLACEMENTS[0]:
-        return math.nan
-    return float(np.median(_off_similarity(points))) / length
+    return np.linalg.norm(points[:, 2:] - turned[:, :2] / turned[:, 2:] * (fx, fy) - (cx, cy), axis=1)
+
+
+def off_turn(pair: CheckPair) -> np.ndarray:
+    """Distances of the corners of a pair from a turn of the camera, whose focal length may be another.
+
+    Args:
+        pair: corners.
+
+    Returns:
+        ``(N,)`` pixels, from the turn that most of them follow, with a focal length up to 1.5 times longer or shorter.
+    """
+    fx, fy, cx, cy = pair.intrinsics
+    points = pair.points.astype(np.float64) - (cx, cy, cx, cy)
+    first, second = points[:, :2] * (1, fx / fy), points[:, 2:] * (1, fx / fy)
+    shift = np.median(second - first, axis=0) / fx
+    turn, stretch = se3.exp(torch.tensor([0.0, 0, 0, -shift[1], shift[0], 0], dtype=torch.float64))[3:], 0.0
+    weights = np.ones(len(points))
+    for _ in range(_TURN_ROUNDS):
+        focal = fx * math.exp(stretch)
+        rays = np.column_stack([first / focal, np.ones(len(first))])
+        there = so3.rotate(turn.expand(len(rays), 4), torch.from_numpy(rays)).numpy()
+        z = np.maximum(there[:, 2:], 0.1)
+        away = second - focal * there[:, :2] / z
+        distances = np.linalg.norm(away, axis=1)
+        weights = 1 / (distances**2 + max(float(np.median(distances)), _NOISE) ** 2)
+        # Derivatives by a turn after this one and by the logarithm of the focal length.
+        rows = np.zeros((len(rays), 2, 4))
+        moved = np.stack([np.cross(axis, there) for axis in np.eye(3)], 2)  # (N, 3, 3), an axis in each column
+        rows[..., :3] = focal * (moved[:, :2] - there[:, :2, None] * moved[:, 2:] / z[..., None]) / z[..., None]
+        shorter = so3.rotate(turn.expand(len(rays), 4), torch.from_numpy(rays * (-1, -1, 0))).numpy()
+        rows[..., 3] = focal * (there[:, :2] + shorter[:, :2] - there[:, :2] * shorter[:, 2:] / z) / z
+        normal = np.einsum("n,nij,nik->jk", weights, rows, rows)
+        right = np.einsum("n,nij,ni->j", weights, rows, away)
+        step = np.linalg.solve(normal + 1e-6 * np.diag(np.diag(normal)) + 1e-12 * np.eye(4), right)
+        turn = so3.multiply(so3.exp(torch.from_numpy(step[:3])), turn)
+        stretch = float(np.clip(stretch + step[3], -_STRETCH, _STRETCH))
+    return distances
 
 
 def _off_similarity(points: np.ndarray) -> np.ndarray:

@@ -18,6 +18,8 @@ from dvo.odometry.checks.check_pairs import (
     epipolar_distances,
     followed,
     median_displacement,
+    off_turn,
+    parallax,
     relief,
 )
 
@@ -162,3 +164,31 @@ def test_a_scene_has_relief():
     still, moved = np.array([0.0, 0, 0, 0, 0, 0, 1]), np.array([0.3, 0, 0, 0, 0, 0, 1])
     assert relief(pair, still, moved) > 0.1
     assert np.isnan(relief(CheckPair(0, 4, np.tile(first, 2).astype(np.float32), K), still, still))
+
+
+@given(
+    turn=st.tuples(st.floats(0.05, 0.3), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1)), longer=st.floats(0.75, 1.35),
+)  # fmt: skip
+@settings(max_examples=20, deadline=None)
+def test_a_turn_with_another_focal_length_is_one(turn, longer):
+    """Some corners are on what moves before the camera."""
+    rng = np.random.default_rng(0)
+    first = rng.uniform([10, 10], [150, 110], (80, 2))
+    rays = np.column_stack([(first - K[2:]) / K[:2] / longer, np.ones(80)])
+    rays = rays @ cv2.Rodrigues(np.array([turn[1], turn[0], turn[2]]))[0].T
+    second = longer * rays[:, :2] / rays[:, 2:] * K[:2] + K[2:]
+    points = np.column_stack([first, second + rng.normal(0, 0.03, (80, 2))])
+    points[:12, 2:] += rng.uniform(-30, 30, (12, 2))
+    pair = CheckPair(0, 4, points, K)
+    assert np.median(off_turn(pair)) < 0.1
+
+
+def test_a_scene_is_no_turn():
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-1, -0.6, 2], [1, 0.6, 6], (80, 3))
+    first, second = (x[:, :2] / x[:, 2:] * K[:2] + K[2:] for x in (points, points + [0.3, 0, 0]))
+    pair = CheckPair(0, 4, np.column_stack([first, second]).astype(np.float32), K)
+    still, moved = np.array([0.0, 0, 0, 0, 0, 0, 1]), np.array([0.3, 0, 0, 0, 0, 0, 1])
+    moved_by = median_displacement(pair.points)
+    assert np.median(off_turn(pair)) > 0.1 * moved_by
+    assert np.median(parallax(pair, still, moved)) == pytest.approx(moved_by, rel=1e-3)

@@ -627,33 +627,13 @@ def _drift_sigma(problem: Smoother) -> Array:
     return sigma
 
 
-def _drifts(problem: Smoother, values: Values) -> tuple[Array, Array, Array, float]:
-    """Drift of the visual orientation and of the log scale between nodes: deviations, whitened residuals and roots of
-    their weights, ``(N - 1, 4)``, and cost. Poses that jump do so in their orientation, whose weights are robust."""
-    sigma = _drift_sigma(problem)
-    residual = np.diff(values.drift, axis=0) / sigma
-    weight = np.ones_like(residual)
-    weight[:, :3], cost = _robust(residual[:, :3])
-    return sigma, residual, weight, cost + 0.5 * float((residual[:, 3] ** 2).sum())
-
-
-def _add_drift(problem: Smoother, values: Values, system: ChainSystem) -> float:
-    """Drift of the visual orientation and of the log scale; cost."""
-    sigma, residual, weight, cost = _drifts(problem, values)
-    step = np.zeros((len(sigma), 4, 4))
-    index = np.arange(4)
-    step[:, index, index] = weight / sigma
-    _add_pairs(system, weight * residual, -step, step, STATE)
-    return cost
-
-
 def _add_visual(problem: Smoother, values: Values, system: ChainSystem) -> float:
     """Visual orientations and displacements, and their drift; cost."""
     segment = problem.nodes.segment
     begins = np.concatenate([[problem.past is None], segment[1:] != segment[:-1]])
     held, index = np.flatnonzero(begins), np.arange(STATE, NODE)
     system.diagonal[held[:, None], index, index] += _FIXED  # the drift of a segment begins with its first node
-    by_drift = _add_drift(problem, values, system)
+    drift = _add_walk(system, values.drift, _drift_sigma(problem), STATE)
     turns, by_turns = _orientations(problem, values)
     residual, states, _, shared = turns.weighted()
     system.diagonal += _turn(states) @ states
@@ -664,23 +644,21 @@ def _add_visual(problem: Smoother, values: Values, system: ChainSystem) -> float
     moves, by_moves = _displacements(problem, values)
     residual, before, after, shared = moves.weighted()
     _add_pairs(system, residual, before, after, 0, shared)
-    return by_turns + by_moves + by_drift
+    return by_turns + by_moves + 0.5 * float((drift**2).sum())
 
 
 def _visual_error(problem: Smoother, values: Values, solved: ChainSolution) -> Array:
     """Squared residuals of the images over their expectation (Förstner's estimate of components of variance).
 
-    Each residual is expected to be as large as its noise, less what the solution has adapted to it. Single wrong poses
-    count less, as in the solution: the first ones of a rolling shutter, before it is corrected, can be ten times as
-    wrong as those after them, and tell nothing of these.
+    Each residual is expected to be as large as its noise, less what the solution has adapted to it.
     """
     options, pairs = problem.options, solved.pairs
     inside = problem.nodes.segment[1:] == problem.nodes.segment[:-1]
     if pairs is None or not inside.any():
         return np.ones(3)
     turns, moves = _orientations(problem, values)[0], _displacements(problem, values)[0]
-    sigma, residual, weight, _ = _drifts(problem, values)
-    sigma, steps = sigma[inside], (weight * residual)[inside]
+    sigma = _drift_sigma(problem)[inside]
+    steps = np.diff(values.drift, axis=0)[inside] / sigma
     by_step = np.zeros((4, pairs.shape[1]))
     by_step[:, STATE:NODE], by_step[:, NODE + STATE : 2 * NODE] = -np.eye(4), np.eye(4)
     drifts = 1 - _spread(np.tile(by_step, (len(steps), 1, 1)), pairs[inside]) / sigma**2
@@ -688,8 +666,7 @@ def _visual_error(problem: Smoother, values: Values, solved: ChainSolution) -> A
     nodes = np.concatenate([np.delete(np.delete(pairs, second, 1), second, 2), solved.covariance[None]])
     oriented = 1 - _spread(np.concatenate([turns.before, turns.shared], -1), nodes)
     displaced = 1 - _spread(np.concatenate([moves.before, moves.after, moves.shared], -1)[inside], pairs[inside])
-    turned, moved = turns.residual * turns.weight, (moves.residual * moves.weight)[inside]
-    rotation, scale = np.split(steps, [3], axis=1)
+    turned, moved, (rotation, scale) = turns.residual, moves.residual[inside], np.split(steps, [3], axis=1)
     squares = np.array([(turned**2).sum() + (rotation**2).sum(), (moved**2).sum(), (scale**2).sum()])
     expected = np.array([oriented.sum() + drifts[:, :3].sum(), displaced.sum(), drifts[:, 3].sum()])
     usual = np.array([options.rotation_factor, options.position_factor, options.scale_factor]) ** -2.0

@@ -146,14 +146,3 @@ def test_the_noise_of_images_grows_with_the_square_of_the_angular_rate() -> None
     fast = replace(at_rest, gyro=at_rest.gyro + [0.0, 3 * smoother.HASTE, 0.0])
     assert np.allclose(replace(problem, samples=at_rest).haste, 1.0)
     assert np.allclose(replace(problem, samples=fast).haste, 10.0)
-
-
-def test_first_poses_that_are_wrong_tell_no_noise_of_the_others() -> None:
-    """As those of a rolling shutter, which is corrected only from the second second on."""
-    for grade in ("euroc", "phone"):
-        recording, rng = record(4, seconds=9.0, grade=grade), np.random.default_rng(0)
-        early = np.flatnonzero(recording.times < recording.times[0] + 1.0)
-        rotation = recording.rotation.copy()
-        rotation[early] = rotation[early] @ so3_exp(rng.normal(0, 0.015, (len(early), 3)))
-        right, wrong = solved(recording, 8.0), solved(replace(recording, rotation=rotation), 8.0)
-        assert (wrong.visual_error[:2] < 10 * right.visual_error[:2]).all()

@@ -43,8 +43,8 @@ LEAST_RELIEF = 0.03
 recordings of cameras that move through a scene, 0.01 in one of a camera that turns and zooms on a tripod."""
 LEAST_SHIFT = 0.4
 """Share of the corners' motion that is no turn by the poses (:attr:`Quality.shift`), where a turn explains all of it,
-below which the camera may turn in its place: 0.07 to 0.33
-in recordings and renderings of cameras that do. No motion of sixteen others was a turn to less than 0.049 of it."""
+below which the camera may turn in its place: 0.05 to 0.33
+in recordings and renderings of cameras that do. No motion of 22 recordings of others was a turn to less than 0.049."""
 MOST_JUMPS = 2
 """Jumps in a hundred frames."""
 

@@ -41,10 +41,9 @@ most of what is seen, and little holds the scale."""
 LEAST_RELIEF = 0.03
 """Relief of the corners (:attr:`Quality.relief`) below which the picture moves as a whole: 0.12 to 0.99 in twelve
 recordings of cameras that move through a scene, 0.01 in one of a camera that turns and zooms on a tripod."""
-LEAST_SHIFT = 0.4
-"""Share of the corners' motion that is no turn by the poses (:attr:`Quality.shift`), where a turn explains all of it,
-below which the camera may turn in its place: 0.05 to 0.33
-in recordings and renderings of cameras that do. No motion of 22 recordings of others was a turn to less than 0.049."""
+LEAST_PARALLAX = 0.4
+"""Share of the corners' motion that is parallax by the poses (:attr:`Quality.turn_parallax`), where a turn explains all
+of it, below which the camera may turn in its place: 0.05 to 0.33 in recordings and renderings of cameras that do."""
 MOST_JUMPS = 2
 """Jumps in a hundred frames."""
 
@@ -78,7 +77,7 @@ class Quality:
         still: share of the frames through which followed corners hardly move though the poses do.
         relief: how far the followed corners of a pair are from moving as a whole (shift, turn and zoom of the picture),
             over the parallax that the poses give them, median of the pairs; NaN without parallax.
-        shift: share of the motion of these corners that the poses do not take for a turn, though a turn of the camera
+        turn_parallax: share of the motion of these corners that is parallax by the poses, though a turn of the camera
             in its place, perhaps with another focal length, explains all of it; median of the pairs, NaN where none
             does.
         jumps: number of frames between which the camera moved far more than before and after.
@@ -107,7 +106,7 @@ class Quality:
     checks: int = 0
     still: float = 0.0
     relief: float = float("nan")
-    shift: float = float("nan")
+    turn_parallax: float = float("nan")
     jumps: int = 0
     fixed: float = 0.0
     second: float = float("nan")
@@ -199,7 +198,7 @@ def without_calibration(quality: Quality, guessed: bool = True) -> Quality:
             "the picture moves as a whole: without a calibration a turn or a zoom looks like a motion before a flat "
             "scene"
         )
-    elif quality.shift < LEAST_SHIFT:
+    elif quality.turn_parallax < LEAST_PARALLAX:
         reason = (
             "the picture moves as if the camera turned in its place: without a calibration that looks like a motion"
         )

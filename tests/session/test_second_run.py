@@ -204,13 +204,16 @@ def test_a_picture_that_turns_is_doubtful_where_no_calibration_was_given():
     class Clip(list):
         calibrated = True
 
-    turned, clip = replace(SURE, shift=0.3), Clip(frames(5))
+    turned, clip = replace(SURE, turn_parallax=0.3), Clip(frames(5))
     assert dvo.run(Walk(quality=turned), clip).result.quality.verdict == "good"
     clip.calibrated = False
     quality = dvo.run(Walk(quality=turned), clip).result.quality
     assert quality.verdict == "doubtful" and "turned in its place" in quality.reason
-    for shift in (0.6, np.nan):
-        assert dvo.run(Walk(quality=replace(SURE, shift=shift, relief=0.01)), clip).result.quality.verdict == "good"
+    for share in (0.6, np.nan):
+        assert (
+            dvo.run(Walk(quality=replace(SURE, turn_parallax=share, relief=0.01)), clip).result.quality.verdict
+            == "good"
+        )
 
 
 def test_what_arrives_once_is_not_read_again():

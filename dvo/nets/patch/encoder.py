@@ -156,7 +156,9 @@ class Encoder(_StrideFour):
         Returns:
             Stem features, centred on image pixels ``(2u, 2v)``.
         """
-        if use_kernels(images):  # convolutions are faster in this order, and keep it if all strides are those of a copy
+        records = torch.is_grad_enabled() and self.conv1.weight.requires_grad
+        if use_kernels(images) and not records:
+            # Convolutions are faster in this order, and keep it if all strides are those of a copy.
             images = torch.empty_like(images, memory_format=torch.channels_last).copy_(images)
         return self.layer1(normalise(self.conv1(images), self.norm1))
 

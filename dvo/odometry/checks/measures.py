@@ -20,9 +20,8 @@ from dvo.odometry.checks.check_pairs import (
     CheckPairs,
     epipolar_distances,
     median_displacement,
-    off_turn,
-    parallax,
     relief,
+    turn_parallax,
 )
 from dvo.odometry.checks.floating_crop import looked_at, shift_gain
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
@@ -42,8 +41,6 @@ MOST_RELIEFS = 32
 """Pairs whose relief is measured, evenly over the sequence."""
 MOST_TURNS = 8
 """The same of those that a turn of the camera is fitted to."""
-TURNED = 0.03
-"""Distance of the corners from a turn, over their displacement, below which it explains their motion."""
 JUMP = 6.0
 """Length of a step over the longer one of the steps before and after, and over the median, of a jump."""
 
@@ -101,20 +98,12 @@ def measure_quality(
         quality = replace(quality, crop=_shift_gain(graph, placed, shutter, stride))
         some = placed[:: math.ceil(len(placed) / MOST_RELIEFS)]
         reliefs = [value for pair, *poses in some if not math.isnan(value := relief(pair, *poses))]
-        quality = replace(quality, relief=float(np.median(reliefs)) if reliefs else math.nan, shift=_shift(placed))
+        quality = replace(quality, relief=float(np.median(reliefs)) if reliefs else math.nan)
+        turns = turn_parallax(placed[:: math.ceil(len(placed) / MOST_TURNS)])
+        quality = replace(quality, turn_parallax=turns)
     quality = replace(quality, still=_still(graph, checks))
     verdict, reason, remedy = judge(quality, result.frames_read, cause)
     return replace(quality, verdict=verdict, reason=reason, remedy=remedy)
-
-
-def _shift(placed: list[_Placed]) -> float:
-    """See :attr:`dvo.odometry.quality.Quality.shift`."""
-    some = placed[:: math.ceil(len(placed) / MOST_TURNS)]
-    moved = np.array([max(median_displacement(pair.points), 1e-6) for pair, *_ in some])
-    away = np.array([np.median(off_turn(pair)) for pair, *_ in some]) / moved
-    if not np.median(away) < TURNED:
-        return math.nan
-    return float(np.median(np.array([np.median(parallax(pair, *poses)) for pair, *poses in some]) / moved))
 
 
 def _inliers(graph: Map, segment: int, shutter: Shutter) -> tuple[np.ndarray, np.ndarray, float] | None:

@@ -7,8 +7,8 @@ nearly made up for by other depths, and the cost stays flat. The principal point
 coordinates on its own, at the focal length of least cost.
 
 Barrel distortion is one number, the ``alpha`` of the unified camera model (:mod:`dvo.geometry.lenses`), here called
-the bend: 0 is a pinhole camera, 0.5 about k1 = -0.25, two thirds about an equidistant fisheye. It and the focal length
-make up for each other in part, so that for each bend the focal length of least cost is looked for.
+the bend: 0 is a pinhole camera, 0.5 about k1 = -0.25, and two thirds about an equidistant fisheye. It and the focal
+length make up for each other in part, so that for each bend the focal length of least cost is looked for.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ from dvo.odometry.checks.check_pairs import (
     off_turn,
     parallax,
     relief,
+    turn_parallax,
 )
 
 K = np.array([200.0, 190.0, 80.0, 60.0])
@@ -181,6 +182,9 @@ def test_a_turn_with_another_focal_length_is_one(turn, longer):
     points[:12, 2:] += rng.uniform(-30, 30, (12, 2))
     pair = CheckPair(0, 4, points, K)
     assert np.median(off_turn(pair)) < 0.1
+    still, moved = np.array([0.0, 0, 0, 0, 0, 0, 1]), np.array([0.1, 0, 0, 0, 0, 0, 1])
+    moved[3:] = se3.exp(0.75 * torch.tensor([0.0, 0, 0, turn[1], turn[0], turn[2]], dtype=torch.float64))[3:].numpy()
+    assert 0 < turn_parallax([(pair, still, moved)]) < 1  # a part of the turn is taken for a motion to the side
 
 
 def test_a_scene_is_no_turn():
@@ -190,5 +194,5 @@ def test_a_scene_is_no_turn():
     pair = CheckPair(0, 4, np.column_stack([first, second]).astype(np.float32), K)
     still, moved = np.array([0.0, 0, 0, 0, 0, 0, 1]), np.array([0.3, 0, 0, 0, 0, 0, 1])
     moved_by = median_displacement(pair.points)
-    assert np.median(off_turn(pair)) > 0.1 * moved_by
+    assert np.median(off_turn(pair)) > 0.1 * moved_by and np.isnan(turn_parallax([(pair, still, moved)]))
     assert np.median(parallax(pair, still, moved)) == pytest.approx(moved_by, rel=1e-3)

@@ -131,8 +131,15 @@ def test_without_a_board(folder, tmp_path, capsys, monkeypatch, source, code):
     monkeypatch.setattr(command, "self_calibrate", calibrate)
     out = tmp_path / "out"
     assert main(["calibrate", str(folder), "--seed", "4", "--out", str(out)]) == code
-    assert "201 +-" in capsys.readouterr().out
-    assert dvo.open(folder, calib=out / "calib.txt").camera.fx == 201
+    said = capsys.readouterr()
+    assert "201 +-" in said.out and ("no calib.txt is written" in said.err) == (code == 1)
+    if code:
+        assert not (out / "calib.txt").exists(), "a guess is no calibration"
+        return
+    found = dvo.open(folder, calib=out / "calib.txt")
+    assert found.camera.fx == 201 and not found.calibrated
+    assert main(["calibrate", "--show", str(out / "calib.txt")]) == 0
+    assert "found in the images of a clip" in capsys.readouterr().out
 
 
 def test_show_tells_how_a_file_is_read(tmp_path, capsys):

@@ -35,6 +35,13 @@ def calibrated(monkeypatch):
     return sources
 
 
+@pytest.fixture
+def guessed(monkeypatch):
+    """Stands in for a calibration that cannot tell: a picture between bars, whose guess is not that of the images."""
+    kept = SelfCalibration(47.0, 12.0, "prior", 64, 48, 0, "the motion does not tell", guess_from_angle(64, 48))
+    monkeypatch.setattr(camera, "calibrate", lambda source, **options: kept)
+
+
 def test_a_focal_length_that_is_found(image_folder, tmp_path, capsys, calibrated):
     (image_folder.parent / "calib.txt").unlink()
     out = tmp_path / "out"
@@ -58,6 +65,45 @@ def test_a_focal_length_that_is_found(image_folder, tmp_path, capsys, calibrated
     facts = json.loads((again / "run.json").read_text())
     assert facts["camera"]["fx"] == 51.0 and facts["self_calibration"] is None and len(calibrated) == 1
     assert not (again / "calib.txt").exists()
+
+
+def test_a_guess_that_is_kept_is_no_calibration_of_the_next_run(image_folder, tmp_path, capsys, guessed):
+    """No file is written, that of an earlier run goes, and an export after the run has the camera of the run."""
+    (image_folder.parent / "calib.txt").unlink()
+    out = tmp_path / "out"
+    assert main(["run", str(image_folder), "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert "cannot tell (the motion does not tell): keeps 47 +- 12 px" in said.out
+    assert "note: the focal length is a guess: no calib.txt for the next run" in said.err
+    facts = json.loads((out / "run.json").read_text())
+    assert facts["calibration_file"] is None and "calib.txt" not in facts["files"]
+    assert facts["self_calibration"]["source"] == "prior" and not (out / "calib.txt").exists()
+
+    place = tmp_path / "colmap"
+    assert main(["export", str(out), str(place), "--to", "colmap-text", "--export-images", "source"]) == 0
+    model = (place / "sparse" / "0" / "cameras.txt").read_text().splitlines()[-1].split()
+    assert [float(x) for x in model[4:]] == [47, 47, 32, 24]
+    facts["camera"]["model"] = "pinhoel"
+    (out / "run.json").write_text(json.dumps(facts))
+    assert main(["export", str(out), str(tmp_path / "no"), "--to", "colmap", "--export-images", "source"]) == 2
+    assert "run.json: camera" in capsys.readouterr().err
+
+
+def test_a_guess_removes_the_file_of_an_earlier_run(image_folder, tmp_path, calibrated, request):
+    out = tmp_path / "out"
+    assert main(["run", str(image_folder), "--out", str(out)]) == 0 and (out / "calib.txt").is_file()
+    request.getfixturevalue("guessed")
+    assert main(["run", str(image_folder), "--out", str(out), "--overwrite"]) == 0
+    assert not (out / "calib.txt").exists()
+
+
+def test_what_was_found_in_images_stays_so_in_a_file(image_folder, tmp_path, calibrated):
+    """The verdict is that of the run which has found it; numbers without the first line are those of the user."""
+    out = tmp_path / "out"
+    assert main(["run", str(image_folder), "--out", str(out)]) == 0
+    assert not dvo.open(image_folder, calib=out / "calib.txt").calibrated
+    (out / "calib.txt").write_text("51 51 31.5 23.5\n")
+    assert dvo.open(image_folder, calib=out / "calib.txt").calibrated
 
 
 def test_a_calibration_nearby_is_named_and_that_of_somebody_else_is_kept(image_folder, tmp_path, capsys, calibrated):

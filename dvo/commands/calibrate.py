@@ -100,6 +100,7 @@ def _show(arguments: argparse.Namespace) -> int:
         "intrinsics": f"fx {found.fx:.9g}  fy {found.fy:.9g}  cx {found.cx:.9g}  cy {found.cy:.9g}",
         "coefficients": "  ".join(f"{name} {value:.9g}" for name, value in values) or "none",
         "size": f"{found.width}x{found.height}" if found.width and found.height else "not stated",
+        "origin": "found in the images of a clip, not measured" if found.was_found else None,
         "depth scale": None if found.depth_scale is None else f"{found.depth_scale:g}",
         "baseline": None if found.baseline is None else f"{found.baseline:g} m",
         "readout": f"{found.readout:g} s" if found.readout else None,
@@ -190,6 +191,8 @@ def _without_board(source: Source, folder: Path, arguments: argparse.Namespace) 
         )  # fmt: skip
     say_all(found)
     file = folder / results.CALIBRATION
-    found.write(file)
+    if not found.write(file):
+        warn(f"the focal length is a guess: no {file.name} is written", "note")
+        return NOTHING_TRACKED
     say(f"calibration in {file}")
-    return OK if found.found else NOTHING_TRACKED
+    return OK

@@ -27,6 +27,8 @@ def with_calibration(
 ) -> tuple[Source, dict[str, Any]]:
     """Find the focal length of a source that was opened with a guess, print it and write it into a calibration file.
 
+    Where the images do not tell it, the guess is kept and no file is written.
+
     Args:
         source: to track; one with a calibration, or that can be read once, is returned as it is.
         odometry: that will track it; if it keeps no measurements, the weights ``small`` find the focal length.
@@ -54,11 +56,15 @@ def with_calibration(
             )  # fmt: skip
         seed_everything(arguments.seed)  # the same bytes as a run with the calibration file
         say_all(found)
-        written = (not file.exists() or CALIBRATION in files_of_run(folder)) and found.write(file)
-        if not written:
-            warn(f"{file} is not a file of an earlier run, and was not replaced")
+        if found.found:
+            written = (not file.exists() or CALIBRATION in files_of_run(folder)) and found.write(file)
+            if not written:
+                warn(f"{file} is not a file of an earlier run, and was not replaced")
+        else:
+            warn(f"the focal length is a guess: no {CALIBRATION} for the next run", "note")
         source = source.recalibrated(found.calibration, found.kept)
-    elif CALIBRATION in files_of_run(folder) and not _is_given(file, source, arguments.calib):
+    has_none = found is None or not found.found
+    if has_none and CALIBRATION in files_of_run(folder) and not _is_given(file, source, arguments.calib):
         file.unlink(missing_ok=True)  # of an earlier run
     factor = 1 if source.reduction is None else source.reduction.factor
     camera = {**asdict(source.recorded_camera), "turned": source.turned, "reduced_by": factor}

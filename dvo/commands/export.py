@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from dvo.commands.console import TrackingProgress, say
 from dvo.commands.picture import world_root
 from dvo.core.errors import DvoError
+from dvo.data.calibration.calibration import Calibration
 from dvo.data.files.output import check_empty
 from dvo.data.frame import Frame
 from dvo.data.open import open_source
@@ -31,6 +32,7 @@ from dvo.export.formats import (
 )
 from dvo.export.reconstruction import Reconstruction, observe
 from dvo.export.recorded import MOST_IMAGES, ImageChoice, recorded_images
+from dvo.geometry.camera import Camera
 from dvo.map.io.serialisation import load_graph
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.odometry.protocol import Result, Status
@@ -38,7 +40,7 @@ from dvo.odometry.segments import result_of_log
 from dvo.session import results
 from dvo.session.frame_table import SKIPPED, FrameRow, near
 from dvo.session.results_reader import read_results
-from dvo.session.run_facts import read_facts
+from dvo.session.run_facts import REMEDY, read_facts
 
 SOURCE = "source"  # value of --export-images
 
@@ -240,15 +242,26 @@ def _reopened(folder: Path, facts: dict[str, Any]) -> Source:
             file=folder,
             remedy="put it back, or track again with --save-map and export the map file",
         )
-    own, was_found = folder / results.CALIBRATION, facts.get("calibration_file")
-    if was_found and not own.is_file():
-        raise DvoError("the calibration that the run has found is not there", file=own, remedy="put it back")
-    calib = str(own) if was_found else path("calib") or options.get("calib")
+    calib = path("calib") or options.get("calib")
+    if facts.get("self_calibration"):  # found in the images, or a guess, of which there is no file
+        calib = _recorded_calibration(facts, folder / results.SUMMARY)
     names = ("fps", "topic", "start", "end", "mask_invert")
     more = {name: options[name] for name in names if options.get(name) is not None}
     if options.get("max_pixels") is not None:
         more["max_pixels"] = options["max_pixels"] or None
     return open_source(source, calib=calib, times=path("times"), mask=path("mask"), guess=True, **more)
+
+
+def _recorded_calibration(facts: dict[str, Any], file: Path) -> Calibration:
+    """Calibration that a run has used, from its run.json."""
+    entry = facts.get("camera") or {}
+    names = ("fx", "fy", "cx", "cy", "width", "height", "model", "coefficients")
+    try:
+        camera = Camera(*(entry[name] for name in names))
+    except (DvoError, KeyError) as error:
+        message = error.message if isinstance(error, DvoError) else "missing"
+        raise DvoError(message, file=file, field="camera", remedy=REMEDY) from None
+    return Calibration(**asdict(camera), file=file)
 
 
 def _export_map_file(file: Path, out: str, name: str, segment: int | None) -> None:

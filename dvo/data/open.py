@@ -204,7 +204,7 @@ def open_source(
         selection = Selection(interval, stride, reduction)
         reading = Reading(
             camera, selection, calibration=calibration, guess=guessed, masks=masks, groundtruth=truth,
-            undistort=undistort, doubts=tuple(doubts), inertial=inertial,
+            undistort=undistort, doubts=tuple(doubts), inertial=inertial, given=not calibration.was_found,
         )  # fmt: skip
         return Source(recording, reading)
     except DvoError as error:  # the lens model does not know its file

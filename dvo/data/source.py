@@ -54,7 +54,8 @@ class Reading:
         stages: that follow, in order.
         calibration: of the recorded images, as read; None for a stream.
         guess: of the focal length; None for a calibration.
-        given: the calibration was, or the source; False for one that was found in the images.
+        given: the calibration was, or the source brings it; False for one that was found in images, these or others
+            (:attr:`dvo.data.calibration.calibration.Calibration.was_found`).
         masks: of the recorded images; None for none.
         depth_calibration: of depth images that are not registered to the images; None for others.
         groundtruth: camera-to-world poses; None for none.
@@ -100,8 +101,8 @@ class Source:
         masks: of the recorded images; None for none.
         guess: of the focal length, for a source without a calibration that was opened with one, as long as nothing
             better is known; None otherwise.
-        calibrated: a calibration was given, or the source brings one; False with a guess, or one that was found in the
-            images (:meth:`recalibrated`).
+        calibrated: a calibration was given, or the source brings one; False with a guess, or one that was found in
+            images (:meth:`recalibrated`, or the file that a run without a calibration has written).
         turned: degrees clockwise by which frames are turned to stand upright, as a video or EXIF data ask for.
         stride: every how many-th frame is read.
         frame_count: frames to expect, the stride taken into account; None if a video does not say. A video's header may

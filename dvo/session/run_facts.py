@@ -74,6 +74,8 @@ _LOOP = {
 }  # fmt: skip
 _QUALITY = {"verdict": _TEXT, "reason": _TEXT, "remedy": _TEXT}
 _FRAMES = {"read": _COUNT, "fed": _COUNT, "tracked": _COUNT, "lost": _COUNT}
+_CAMERA = {name: _NUMBER for name in ("fx", "fy", "cx", "cy")} | {"width": _COUNT, "height": _COUNT}
+_LENS = {"model": _TEXT, "coefficients": _listed(_NUMBER)}
 _FOCAL = {"focal": _NUMBER, "deviation": _NUMBER, "source": _TEXT}
 _METRIC_SEGMENT = _table({"segment": _COUNT, "source": _TEXT}, ("segment", "source"))
 _INFO = {
@@ -91,6 +93,7 @@ _RUN = _table(
         "breaks": _listed(_table(_BREAK, ("frames", "reason", "new_segment"))),
         "info": _table(_INFO),
         "metrics": _table({"alignment": _TEXT, **_METRICS}),
+        "camera": _table(_CAMERA | _LENS, tuple(_CAMERA | _LENS)),
         "self_calibration": _table(_FOCAL, ("focal", "deviation", "source")),
         "seconds": _named(_NUMBER),
         "fps": _NUMBER,

@@ -32,6 +32,10 @@ _SIZES = [
 ]  # fmt: skip
 
 
+FOUND_BY_DVO = "# focal length found by dvo; a run without a calibration replaces this file\n"
+"""First line of a calibration file of a focal length that was found in the images of a clip."""
+
+
 @dataclass(frozen=True)
 class Calibration:
     """Intrinsics in pixels, without an image yet.
@@ -44,6 +48,7 @@ class Calibration:
         depth_scale: units of a metre in depth images of integers that belong to the images.
         baseline: metres from the camera to the right camera of a rectified pair with the same intrinsics.
         readout: seconds in which a rolling shutter reads the rows, as in :class:`dvo.geometry.camera.Camera`.
+        was_found: it is from a file whose focal length dvo has found in the images of a clip (:data:`FOUND_BY_DVO`).
         dialect: form of the file that it was read from.
         ignored: keys of the file that were not used.
         notes: what the user has to know about the file, in sentences; :meth:`doubts` has them too.
@@ -61,6 +66,7 @@ class Calibration:
     depth_scale: float | None = None
     baseline: float | None = None
     readout: float = 0.0
+    was_found: bool = field(default=False, compare=False, repr=False)
     dialect: str = field(default="", compare=False, repr=False)
     ignored: tuple[str, ...] = field(default=(), compare=False, repr=False)
     notes: tuple[str, ...] = field(default=(), compare=False, repr=False)

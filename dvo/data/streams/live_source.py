@@ -253,8 +253,11 @@ def open_stream(
         camera = (calib or assumed.calibration).camera(width, height)
         masks = None if mask is None else open_masks(Path(mask), recording, (width, height), mask_invert)
         selection = Selection(interval, stride)
-        reading = Reading(camera, selection, undistort=undistort, masks=masks, doubts=tuple(doubts))
-        return LiveSource(recording, reading if calib else replace(reading, guess=assumed))
+        reading = Reading(
+            camera, selection, guess=None if calib else assumed, given=calib is not None and not calib.was_found,
+            undistort=undistort, masks=masks, doubts=tuple(doubts),
+        )  # fmt: skip
+        return LiveSource(recording, reading)
     except BaseException:
         recording.live.close()
         raise
@@ -263,7 +266,7 @@ def open_stream(
 def _assumption(guess: FocalGuess) -> str:
     return (
         f"no calibration: assuming the usual angle of view, a focal length of {guess.focal:.0f} px; it can be found in "
-        "a recorded clip (dvo run CLIP), which writes a calib.txt for --calib"
+        "a recorded clip (dvo run CLIP), which then writes a calib.txt for --calib"
     )
 
 

@@ -6,14 +6,12 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from dvo.data.calibration.calibration import Calibration
+from dvo.data.calibration.calibration import FOUND_BY_DVO, Calibration
 from dvo.data.calibration.focal_guess import FocalGuess, centred
 from dvo.data.files.output import replaced
 
 SELF_CALIBRATED = "self-calibration"
 """Source of a focal length that was found in the images."""
-
-_HEADER = "# focal length found by dvo; a run without a calibration replaces this file\n"
 
 
 @dataclass(frozen=True)
@@ -93,6 +91,8 @@ class SelfCalibration:
     def write(self, file: Path | str) -> bool:
         """Write a calibration file for the next run, unless a file that somebody else has written is in its place.
 
+        A guess that was kept is not written: the next run would take it for a calibration.
+
         Args:
             file: text file, ``fx fy cx cy``, or YAML for a lens with distortion.
 
@@ -102,7 +102,7 @@ class SelfCalibration:
         Raises:
             OSError: it cannot be written.
         """
-        if is_foreign(Path(file)):
+        if not self.found or is_foreign(Path(file)):
             return False
         c = self.calibration
         with replaced(Path(file)) as part:
@@ -112,7 +112,7 @@ class SelfCalibration:
                 names = zip(("fx", "fy", "cx", "cy"), line.split(), strict=True)
                 line = "".join(f"{name}: {value}\n" for name, value in names)
                 line += f"model: {c.model}\nalpha: {self.bend:.4f}\nbeta: 1\n"
-            part.write_text(f"{_HEADER}# {told}\n{line}", encoding="utf-8")
+            part.write_text(f"{FOUND_BY_DVO}# {told}\n{line}", encoding="utf-8")
         return True
 
 
@@ -125,7 +125,7 @@ def is_foreign(file: Path) -> bool:
     if not file.exists():
         return False
     with file.open("rb") as stream:
-        return stream.read(len(_HEADER)) != _HEADER.encode()
+        return stream.read(len(FOUND_BY_DVO)) != FOUND_BY_DVO.encode()
 
 
 def simple_camera(focal: float, aside: tuple[float, float], bend: float, width: int, height: int) -> Calibration:

@@ -17,6 +17,7 @@ import pytest
 
 import dvo
 from dvo.core.errors import DvoError
+from dvo.data.calibration.calibration import FOUND_BY_DVO
 from dvo.data.streams.capture import Capture, StreamClock, is_stream, shown
 from dvo.data.streams.live_source import LiveSource, open_stream
 from tests.support.interlaced import moving, woven
@@ -140,6 +141,13 @@ def test_a_slow_consumer_gets_the_newest_frames(camera, make):
     assert [frame.index for frame in source] == [9, 10, 11]
     assert [frame.index for frame in open_stream("webcam:0", calib=make.calib(), queue=0)] == list(range(12))
     assert [frame.index for frame in open_stream("webcam:0", calib=make.calib(), queue=0, stride=5)] == [0, 5, 10]
+
+
+def test_a_focal_length_of_a_clip_is_found_and_not_given(camera, make):
+    with open_stream("webcam:0", calib=make.calib()) as given:
+        assert given.calibrated
+    with open_stream("webcam:0", calib=make.text("found.txt", f"{FOUND_BY_DVO}50 51 31 23\n")) as found:
+        assert not found.calibrated and found.guess is None
 
 
 def test_images_that_do_not_decode_are_left_out(camera, make):

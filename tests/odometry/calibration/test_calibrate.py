@@ -114,6 +114,12 @@ def test_the_file_for_the_next_run(tmp_path, found):
     assert not found.write(file) and file.read_text() == "1 2 3 4\n"
 
 
+def test_a_guess_that_is_kept_is_no_file(tmp_path):
+    guess = FocalGuess(100.0, 25.0, "prior", 192, 144)
+    kept = SelfCalibration(100.0, 25.0, "prior", 192, 144, 0, "too few frames could be tracked", guess)
+    assert not kept.write(tmp_path / "calib.txt") and not any(tmp_path.iterdir())
+
+
 @pytest.fixture
 def leaning(clip, monkeypatch):
     """Calibration by measurements that ask for a share of the way to 200 px, the logarithm known to 1 %."""

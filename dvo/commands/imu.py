@@ -66,8 +66,8 @@ def check(arguments: argparse.Namespace) -> int:
     check_outputs({"--json": arguments.json}, {"the samples": given.file})  # found beside the source
     samples = given.rough()
     refusal = _refusal(given)
-    times, rotations = (None, None) if arguments.no_vision or source is None else _seen(source, arguments)
-    report = check_sensor(samples, times, rotations)
+    seen = () if arguments.no_vision or source is None else _seen(source, arguments)
+    report = check_sensor(samples, *seen)
     if refusal is not None:
         report = replace(report, findings=(refusal, *report.findings))
     _print(report, samples.origin)
@@ -118,8 +118,8 @@ def _refusal(given: InertialInput) -> Finding | None:
     return Finding("notes", Level.NOTE, "; ".join(notes), "compare with what was recorded")
 
 
-def _seen(source: Source, arguments: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
-    """Times and orientations of the longest segment of the beginning; none if no image is tracked."""
+def _seen(source: Source, arguments: argparse.Namespace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times, orientations and places of the longest segment of the beginning; none if no image is tracked."""
     device = device_of(arguments.device)
     seed_everything(arguments.seed)
     count = arguments.frames if source.frame_count is None else min(arguments.frames, source.frame_count)
@@ -135,9 +135,10 @@ def _seen(source: Source, arguments: argparse.Namespace) -> tuple[np.ndarray, np
     result = done.result
     number = result.longest
     if number is None:
-        return np.zeros(0), np.zeros((0, 3, 3))
+        return np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3))
     trajectory = result.segments[number].trajectory
-    return trajectory.timestamps, quaternion_to_matrix(trajectory.poses_wc[:, 3:])
+    poses = trajectory.poses_wc
+    return trajectory.timestamps, quaternion_to_matrix(poses[:, 3:]), poses[:, :3]
 
 
 def _print(report: SensorReport, origin: str) -> None:

@@ -67,7 +67,7 @@ class Recording:
 
 def record(seed: int, *, still: float = 0.0, speed: tuple[float, float, float] = (0, 0, 0), grade: str = "euroc",
            seconds: float = 14.0, turning: bool = True, drift: float = 0.0, swing: float = 0.0,
-           walk: float = 0.0, unit: float = 0.0) -> Recording:  # fmt: skip
+           walk: float = 0.0, unit: float = 0.0, reach: float = 0.25, arm: float = 0.0) -> Recording:  # fmt: skip
     """Recording of a hand that moves about.
 
     Images tell a turn and a shift sideways apart by parallax alone: a wrong orientation comes with a wrong place.
@@ -83,18 +83,21 @@ def record(seed: int, *, still: float = 0.0, speed: tuple[float, float, float] =
         swing: motion along one axis before ``still`` has passed, metres.
         walk: random walk of the orientation of the images, rad in the root of a second.
         unit: random walk of the logarithm of their unit, in the root of a second.
+        reach: deviation of the place, metres.
+        arm: from a point that the camera turns about to it, along its axis, metres.
     """
     rng, further = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     count = int(seconds * RATE) + 1
     time = np.arange(count) / RATE
     rise = np.clip((time - still + 1) / 2, 0, 1)[:, None] if still else np.ones((count, 1))
     rise = rise**3 * (10 - 15 * rise + 6 * rise**2)
-    path = 0.25 * _wander(rng, count) * rise + np.outer(time, speed)
+    path = reach * _wander(rng, count) * rise + np.outer(time, speed)
     if swing:
         axis = further.normal(size=3)
         path = path + swing * _wander(further, count)[:, :1] * (1 - rise) * axis / np.linalg.norm(axis)
     turns = 0.35 * _wander(rng, count) * (1 if turning else rise)
     camera = so3_exp(turns)
+    path = path + arm * camera[..., 2]
     rotation, position = camera @ CAMERA_IMU, path - camera @ CAMERA_IMU @ LEVER
     velocity = np.gradient(position, 1 / RATE, axis=0, edge_order=2)
     speeding = np.gradient(velocity, 1 / RATE, axis=0, edge_order=2)

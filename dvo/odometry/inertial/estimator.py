@@ -20,6 +20,7 @@ from dvo.odometry.inertial.preintegration import integrated_turn, preintegrate, 
 from dvo.odometry.inertial.smoother import (
     GRAVITY,
     NODE,
+    OPPOSED,
     SHIFT,
     STATE,
     Past,
@@ -29,6 +30,7 @@ from dvo.odometry.inertial.smoother import (
     SmootherOptions,
     Values,
     VisualNodes,
+    acceleration_sign,
     first_values,
     linear_start,
     motion_factors,
@@ -667,6 +669,11 @@ class InertialEstimator:
         scale, gravity, bias = linear_start(problem)
         problem.gyro_bias = bias
         self._turned_apart(problem, nodes, np.tile(bias, (len(nodes), 1)), np.zeros((len(nodes), 3)), problem.offset)
+        if scale < 0 and acceleration_sign(problem) < OPPOSED:
+            raise _DisagreementError(
+                "accelerations of samples and images are opposed: the accelerometer has the wrong sign (its axis that "
+                "points up reads +9.8 at rest)"
+            )
         best: Smoothed | None = None
         for factor in STARTS:
             first = np.array([np.log(factor * (scale if scale > 1e-6 else 1.0))])

@@ -18,7 +18,10 @@ _MIN_FRAMES = 20
 
 
 def check_sensor(
-    samples: InertialSamples, timestamps: np.ndarray | None = None, rotations_wc: np.ndarray | None = None
+    samples: InertialSamples,
+    timestamps: np.ndarray | None = None,
+    rotations_wc: np.ndarray | None = None,
+    positions_wc: np.ndarray | None = None,
 ) -> SensorReport:
     """Check inertial samples.
 
@@ -27,6 +30,7 @@ def check_sensor(
             wrong.
         timestamps: ``(N,)`` increasing times of frames with a pose in one world, seconds; None without vision.
         rotations_wc: ``(N, 3, 3)`` their orientations, camera to world.
+        positions_wc: ``(N, 3)`` their places in any unit; None: the sign of the accelerometer is not checked.
 
     Returns:
         Numbers and findings.
@@ -40,7 +44,7 @@ def check_sensor(
     findings += found.findings
     alignment = None
     if timestamps is not None and rotations_wc is not None and len(timestamps) >= _MIN_FRAMES:
-        alignment, found = check_against_vision(samples, timestamps, rotations_wc)
+        alignment, found = check_against_vision(samples, timestamps, rotations_wc, positions_wc)
         values |= found.values
         known = {finding.name for finding in findings}
         findings += [finding for finding in found.findings if finding.name not in known]

@@ -15,6 +15,7 @@ the camera turns. How noisy a visual trajectory is, its residuals tell (:attr:`S
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 
 import numpy as np
 
@@ -44,6 +45,10 @@ HASTE = 2.0
 little that is seen for long."""
 USUAL = 10.0
 """Measurements that the usual noise of visual poses counts for, where it is estimated."""
+OPPOSED = -0.5
+"""Correlation (:func:`acceleration_sign`) below which accelerations of the samples are opposed to the images'."""
+_SURE = 8.0  # deviations of a scale whose sign is believed
+_STEP, _STRETCH = 0.25, 4.0  # seconds between nodes that tell the sign, and of a stretch with a gravity of its own
 _FIXED = 1e18  # information of an unknown that is held
 _HELD = 1e14  # of the heading that is held, one direction of three: more would drown the others in rounding errors
 _UNKNOWN = 1e12  # variance of a motion without samples
@@ -398,6 +403,68 @@ def linear_start(problem: Smoother) -> tuple[float, Array, Array]:
     design = np.concatenate([bend(nodes.position)[..., None], -half[..., None] * np.eye(3)], -1)
     found = np.linalg.lstsq(design.reshape(-1, 4), right.reshape(-1), rcond=None)[0]
     return float(found[0]), found[1:], bias
+
+
+def acceleration_sign(problem: Smoother) -> float:
+    """Correlation of the accelerations of the samples with those of the images, which have the sign of the scale.
+
+    The linear solution for the scale as in :func:`linear_start`, with further unknowns that could turn its sign around:
+    lever arm and bias of the accelerometer, and the gravity of each stretch of some seconds. Within a stretch the
+    gyroscope tells the orientations: a visual one that is wrong comes with a wrong place, and with a part of gravity.
+
+    Args:
+        problem: nodes of one segment.
+
+    Returns:
+        -1 to 1 of what these unknowns leave; 0 if the sign is not sure.
+    """
+    stretches = _stretches(problem.nodes.times)
+    blocks, rights = [], []
+    for number, chosen in enumerate(stretches):
+        times, position = problem.nodes.times[chosen], problem.nodes.position[chosen]
+        motion = preintegrate(
+            problem.samples, times + problem.offset, problem.gyro_bias, problem.accel_bias, problem.noise
+        )
+        if not motion.covered.all():
+            continue
+        body = np.stack(list(accumulate(motion.rotation, np.matmul, initial=np.eye(3))))
+        seen = problem.nodes.rotation[chosen] @ problem.rotation_camera_imu
+        left, _, right = np.linalg.svd(np.einsum("nij,nkj->ik", seen, body))
+        body = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right @ body
+        span = motion.duration[:, None, None]
+        columns = [position[..., None], -body]  # of scale and lever arm
+        bent = [np.diff(np.diff(path, axis=0) / span, axis=0) for path in columns]
+        moved = [motion.position[..., None], -motion.position_by_accel]
+        faster = [motion.velocity[..., None], -motion.velocity_by_accel]
+        force, bias = (
+            body[:-2] @ v[:-1] + np.diff(body[:-1] @ p / span, axis=0) for v, p in zip(faster, moved, strict=True)
+        )
+        gravity = np.zeros((len(force), 3, 3 * len(stretches)))
+        gravity[..., 3 * number : 3 * number + 3] = -0.5 * (span[1:] + span[:-1]) * np.eye(3)
+        blocks.append(np.concatenate([*bent, bias, gravity], -1).reshape(-1, gravity.shape[-1] + 7))
+        rights.append(force.reshape(-1))
+    if not blocks:
+        return 0.0
+    design, right = np.concatenate(blocks), np.concatenate(rights)
+    others = np.linalg.qr(design[:, 1:][:, design[:, 1:].any(0)])[0]
+    images, forces = (column - others @ (others.T @ column) for column in (design[:, 0], right))
+    size = float(np.linalg.norm(images) * np.linalg.norm(forces))
+    correlation = float(images @ forces) / size if size > 0 else 0.0
+    freedom = len(right) - others.shape[1] - 1
+    is_sure = correlation**2 * freedom > _SURE**2 * (1 - correlation**2)
+    return correlation if is_sure else 0.0
+
+
+def _stretches(times: Array) -> list[Array]:
+    """Indices of times some tenths of a second apart, in stretches of some seconds."""
+    found = [[0]]
+    for k in range(1, len(times)):
+        since = times[k] - times[found[-1][-1]]
+        if since > 3 * _STEP or times[k] - times[found[-1][0]] > _STRETCH:
+            found.append([k])
+        elif since > _STEP - 1e-6:
+            found[-1].append(k)
+    return [np.array(one) for one in found if len(one) >= 8]
 
 
 def upright(gravity: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Checks of inertial samples against the orientations of a camera: clock, axes, units and biases."""
+"""Checks of inertial samples against the poses of a camera: clock, axes, units, biases and the sign of forces."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dvo.data.inertial import InertialSamples
+from dvo.data.inertial import NOISE_PRESETS, InertialSamples
 from dvo.geometry.poses import matrix_to_quaternion, quaternion_to_matrix, rotation_vector
 from dvo.odometry.inertial.findings import Finding, Found, Level
 from dvo.odometry.inertial.sample_checks import SIGNED_AXES, gravity_error, gyro_bias, in_radians, named_axes
+from dvo.odometry.inertial.smoother import OPPOSED, Smoother, VisualNodes, acceleration_sign
 from dvo.odometry.inertial.temporal import ImuAlignment, align_imu, integrate_gyro
 
 Array = np.ndarray
@@ -25,6 +26,7 @@ _WIDE = 3.0  # seconds on either side of a second search, where the first one fi
 _WINDOW = 4.0  # seconds of vision for one point of the line of offsets
 _MIN_WINDOWS = 3
 _MEAN = 0.5  # seconds over which the force is averaged
+_AXES = ("axes", "accelerometer axes")
 _TELLS = 0.5  # share of the variance that other axes of the accelerometer must leave
 
 
@@ -102,14 +104,15 @@ def clock_line(
 
 
 def check_against_vision(
-    samples: InertialSamples, timestamps: Array, rotations_wc: Array
+    samples: InertialSamples, timestamps: Array, rotations_wc: Array, positions_wc: Array | None = None
 ) -> tuple[ImuAlignment, Found]:
-    """Check samples against orientations of a camera.
+    """Check samples against poses of a camera.
 
     Args:
         samples: with increasing times, in rad/s and m/s^2; a gyroscope in deg/s is told.
         timestamps: ``(N,)`` increasing times of frames.
         rotations_wc: ``(N, 3, 3)`` camera to world.
+        positions_wc: ``(N, 3)`` of the camera in any unit; None: the sign of the accelerometer is not checked.
 
     Returns:
         The alignment, and what was found.
@@ -144,6 +147,9 @@ def check_against_vision(
     parts = [clock, _axes(found, stated)]
     if found.is_offset_told:
         parts.append(_biases(samples, found, timestamps, rotations_wc))
+    is_told = found.is_offset_told and (stated is not None or found.is_rotation_told)
+    if positions_wc is not None and is_told and not any(one.name in _AXES for part in parts for one in part.findings):
+        parts.append(_sign(samples, found, timestamps, rotations_wc, positions_wc))
     for part in parts:
         values |= part.values
         findings += part.findings
@@ -272,6 +278,25 @@ def _biases(samples: InertialSamples, found: ImuAlignment, timestamps: Array, ro
         elif (finding := gravity_error(gravity, "against vision")) is not None and sigma[3:].max() < 0.1:
             findings.append(finding)
     return Found(values, tuple(findings))
+
+
+def _sign(
+    samples: InertialSamples, found: ImuAlignment, timestamps: Array, rotations_wc: Array, positions_wc: Array
+) -> Found:
+    """Sign of all three axes of the accelerometer, by the accelerations of the camera."""
+    none, depth = np.zeros(len(timestamps), int), np.ones(1)
+    problem = Smoother(
+        VisualNodes(timestamps, none, rotations_wc, positions_wc, depth), samples,
+        samples.noise or NOISE_PRESETS["phone"], found.rotation_camera_imu, np.zeros(3), gyro_bias=found.gyro_bias,
+        offset=found.time_offset,
+    )  # fmt: skip
+    correlation = acceleration_sign(problem)
+    values = {"correlation of accelerations": correlation} if correlation else {}
+    if correlation > OPPOSED:
+        return Found(values)
+    text = "its accelerations are opposed to those of the camera: all three axes have the wrong sign"
+    remedy = "give the accelerometer as (-x, -y, -z): at rest, the axis that points up reads +9.8 m/s^2"
+    return Found(values, (Finding("accelerometer axes", Level.UNUSABLE, text, remedy),))
 
 
 def _identity() -> int:

@@ -132,6 +132,8 @@ def _poisoned(kind: str, recording: Recording) -> Recording:
         return recording.with_samples(gyro=np.rad2deg(s.gyro))
     if kind == "axes":
         return recording.with_samples(gyro=s.gyro[:, [1, 0, 2]], accel=s.accel[:, [1, 0, 2]])
+    if kind == "signs":
+        return recording.with_samples(accel=-s.accel)
     if kind == "late":
         return recording.with_samples(times=s.timestamps + 0.1)
     return recording.with_samples(gyro=s.gyro + [0.3, -0.2, 0.1], accel=s.accel + [1.0, -1.0, 0.8])
@@ -139,7 +141,14 @@ def _poisoned(kind: str, recording: Recording) -> Recording:
 
 @pytest.mark.parametrize(
     ("kind", "word"),
-    [("g", "units"), ("degrees", "turn"), ("axes", "turn"), ("late", "an offset of 10"), ("dropped", "gyroscope")],
+    [
+        ("g", "units"),
+        ("degrees", "turn"),
+        ("axes", "turn"),
+        ("late", "an offset of 10"),
+        ("dropped", "gyroscope"),
+        ("signs", "opposed: the accelerometer has the wrong sign"),
+    ],
 )
 def test_poisoned_samples_are_refused_with_the_reason(kind: str, word: str) -> None:
     estimator, reasons = drive(_poisoned(kind, record(3, seconds=6.0)))

@@ -14,6 +14,7 @@ from dvo.odometry.inertial.findings import Level, SensorReport
 from dvo.odometry.inertial.sensor_check import check_sensor
 from dvo.odometry.inertial.vision_checks import clock_line
 from tests.support.hand_motion import CAMERA_IMU, frames, hand_motion, samples
+from tests.support.visual_inertial import record
 
 SECONDS = 16.0
 HARMLESS = {"no rest"}
@@ -88,6 +89,20 @@ def test_axes_of_one_sensor_alone() -> None:
     report = checked(accel=imu.accel[:, [1, 2, 0]])
     finding = report.named("accelerometer axes")
     assert finding is not None and "(z, x, y)" in finding.remedy and names(report) == {"accelerometer axes"}
+
+
+@pytest.mark.parametrize("is_stated", [True, False])
+@pytest.mark.parametrize("options", [{}, {"grade": "phone", "walk": 2e-3}, {"reach": 0.025}], ids=["", "phone", "slow"])
+def test_all_three_signs_of_the_accelerometer(options: dict[str, object], is_stated: bool) -> None:
+    seen = record(7, seconds=16.0, **options)  # type: ignore[arg-type]
+    samples = seen.samples if is_stated else replace(seen.samples, T_camera_imu=None)
+    right = check_sensor(samples, seen.times, seen.rotation, seen.position)
+    assert right.named("accelerometer axes") is None and right.values["correlation of accelerations"] > 0.5
+    wrong = replace(samples, accel=-samples.accel)
+    report = check_sensor(wrong, seen.times, seen.rotation, seen.position)
+    finding = report.named("accelerometer axes")
+    assert finding is not None and "(-x, -y, -z)" in finding.remedy and not report.is_usable
+    assert check_sensor(wrong, seen.times, seen.rotation).named("accelerometer axes") is None, "places tell it"
 
 
 @pytest.mark.long

@@ -9,7 +9,16 @@ import pytest
 
 from dvo.geometry.poses import so3_exp
 from dvo.odometry.inertial import smoother
-from dvo.odometry.inertial.smoother import Similarities, Values, first_values, linear_start, smooth, upright
+from dvo.odometry.inertial.smoother import (
+    OPPOSED,
+    Similarities,
+    Values,
+    acceleration_sign,
+    first_values,
+    linear_start,
+    smooth,
+    upright,
+)
 from tests.support.visual_inertial import CAMERA_IMU, DEPTH, LEVER, OFFSET, SCALE, Recording, record
 
 
@@ -29,6 +38,31 @@ def test_scale_vertical_and_offset_are_found(grade: str, seed: int) -> None:
     up = (found.worlds.rotation[0] @ recording.turn)[2, 2]
     assert np.rad2deg(np.arccos(min(up, 1.0))) < 0.5
     assert abs(found.time_offset - OFFSET) < 1e-3
+
+
+@pytest.mark.parametrize("grade", ["euroc", "phone"])
+@pytest.mark.parametrize(
+    ("options", "is_told"),
+    [
+        ({}, True),
+        ({"walk": 2e-3, "unit": 2e-2}, True),
+        ({"reach": 0.15, "arm": 0.3}, True),
+        ({"reach": 0.0075}, False),
+        ({"still": 30.0}, False),
+        ({"still": 30.0, "turning": False}, False),
+        ({"reach": 0.002, "arm": -0.05}, False),
+        ({"reach": 0.0, "arm": -0.3}, False),
+    ],
+    ids=["hand", "drift", "arm", "slow", "pure rotation", "still", "wrist", "pivot"],
+)
+def test_sign_of_the_accelerations_is_told_or_not_sure(grade: str, options: dict[str, float], is_told: bool) -> None:
+    """A wrong one never, also where the camera turns about a point that the sensor is on the other side of."""
+    for seed in range(6):
+        recording = record(100 + seed, grade=grade, **options)  # type: ignore[arg-type]
+        for sign in (1, -1):
+            problem = recording.with_samples(accel=sign * recording.samples.accel).problem(0.1, 13.9)
+            found = sign * acceleration_sign(problem)
+            assert found >= 0 and (found > -OPPOSED or not is_told)
 
 
 def test_newest_state_is_within_its_covariance() -> None:

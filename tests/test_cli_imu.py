@@ -84,6 +84,9 @@ def test_a_sequence_against_its_camera(sequence, imu, monkeypatch, tmp_path, cap
     calibration.write_text("time_offset: 0.1\npreset: euroc\n")
     code, out, _ = checked(capsys, str(sequence), "--imu-calib", str(calibration), "--device", "cpu")
     assert code == 0 and out.endswith("usable\n") and "time offset:" not in out
+    write(sequence, InertialSamples(imu.timestamps, imu.gyro, -imu.accel), imu.timestamps + 0.1)
+    code, out, _ = checked(capsys, str(sequence), "--imu-calib", str(calibration), "--device", "cpu")
+    assert code == 1 and "give the accelerometer as (-x, -y, -z)" in out
 
 
 def test_samples_that_a_reader_refuses_are_opened_and_named(sequence, imu, capsys):

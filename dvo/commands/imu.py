@@ -38,7 +38,7 @@ from dvo.session.session import run
 
 UNUSABLE = NOTHING_TRACKED
 _INPUTS = ("imu", "imu_calib", "calib", "times")
-_TABLES = (".csv", ".txt", ".jsonl")
+_TABLES = (".csv", ".txt", ".json", ".jsonl")
 
 
 def check(arguments: argparse.Namespace) -> int:

@@ -272,6 +272,13 @@ TARGETS = (
     _one("truth_ned", "t.txt", [row.split(maxsplit=1)[1] for row in poses()], partial(_truth, name="t.txt")),
     _one("inertial_table", "imu.csv", ["time [s],gx,gy,gz,ax,ay,az", *_samples(",")], _inertial),
     _one("inertial_rows", "imu.csv", _samples(" "), _inertial),
+    _one("inertial_long", "imu.csv", ["sensor,time,x,y,z", *(
+        f"{kind},2024-05-01T12:00:00.{10 * k:03}Z,0.1,9.8,0.2" for k in range(20) for kind in ("gyroscope", "acc")
+    )], _inertial),
+    _one("inertial_export", "log.json", ["[", *(
+        f'{{"sensor": "{kind}", "time": "{10**18 + 10**7 * k}", "seconds_elapsed": "0", "z": "0", "y": "9", "x": "1"}},'
+        for k in range(20) for kind in ("Gyroscope", "TotalAcceleration")
+    ), '{"sensor": "Metadata", "platform": "ios"}]'], partial(_inertial, name="log.json")),
     _one("inertial_json", "data.jsonl", [
         f'{{"time": {0.01 * k}, "sensor": {{"type": "{kind}", "values": [0.1, 9.8, 0.2]}}}}'
         for k in range(20) for kind in ("gyroscope", "accelerometer")

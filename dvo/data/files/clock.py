@@ -40,6 +40,7 @@ _DATE = re.compile(
     r"(?<![0-9])((?:19|20)[0-9]{2})([-_.:/]?)(0[1-9]|1[0-2])\2(0[1-9]|[12][0-9]|3[01])[T _.-]{0,3}"
     r"([01][0-9]|2[0-3])([-_.:h]?)([0-5][0-9])[-_.:m]?([0-5][0-9]|60)"
     r"(?:[.,]([0-9]{1,9})|[-_:s]?([0-9]{3}|[0-9]{6}|[0-9]{9}))?(?![0-9])"
+    r"(?:( ?[-+][01][0-9]:[0-5][0-9]|(?:\+| \+| -)[01][0-9][0-5][0-9])(?![0-9:]))?"  # names of images end in -0001
 )
 _NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?")
 _UNIT = re.compile(r"[\[(]\s*([a-zµμ]+)\s*[\])]")
@@ -277,7 +278,7 @@ def parse_date(text: str) -> float | None:
     """Seconds since 1970 (UTC) of the date and time in a text, such as ``IMG_20240131_235959123``.
 
     Args:
-        text: any; year, month, day, hour, minute and second, and perhaps a fraction.
+        text: any; year, month, day, hour, minute and second, and perhaps a fraction, and hours and minutes from UTC.
 
     Returns:
         None if there is none.
@@ -291,6 +292,9 @@ def parse_date(text: str) -> float | None:
     except ValueError:  # 31 April
         return None
     fraction = found[9] or found[10]
+    if found[11]:
+        sign, digits = found[11].strip()[0], found[11].strip()[1:].replace(":", "")
+        moment -= (60 * int(digits[:2]) + int(digits[2:])) * (-60 if sign == "-" else 60)
     return moment + (second == 60) + (int(fraction) / 10 ** len(fraction) if fraction else 0.0)
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.clock import NAMES, PARTS, is_number, parse_time, unit_of_dates, unit_of_name
+from dvo.data.files.clock import NAMES, PARTS, is_number, parse_date, parse_time, unit_of_dates, unit_of_name
 from dvo.data.files.files import MAX_NUMBER, is_file, read_lines
 from dvo.data.inertial import InertialSamples
 from dvo.data.inertial_files.columns import (
@@ -33,6 +33,8 @@ from dvo.data.inertial_files.columns import (
     with_units,
     without_gravity,
 )
+from dvo.data.inertial_files.readings import REMEDY as JSON_REMEDY
+from dvo.data.inertial_files.readings import SENSOR_LOGGER, Readings, by_sensor, read_json
 from dvo.data.inertial_files.tidy import GRAVITY_RANGE, STANDARD_GRAVITY, check_gravity, joined, tidy
 
 RATES = (15.0, 5000.0)
@@ -56,7 +58,7 @@ _PREAMBLE = 100  # lines among which the header is
 _FEWEST_NUMBERS = 3  # in the first row of samples
 _BRIEF = 2.0  # seconds: a recording that would be shorter is rather one of a slower logger in another unit
 _REPEATS = 0.3  # share of repeated times that is told beside a wrong rate
-_NO_GRAVITY = "record the accelerometer with gravity (TotalAcceleration, Accelerometer), not the linear acceleration"
+_NO_GRAVITY = "record the accelerometer with gravity (TotalAcceleration), or Gravity too, not the linear acceleration"
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,8 @@ def read_inertial_table(path: Path, *, rough: bool = False) -> InertialSamples:
     """Read inertial samples of a text file; where it holds one sensor, those of the other from the file beside it.
 
     Args:
-        path: ``.csv`` or ``.txt``, ``.jsonl`` of Spectacular AI, or a folder with a file for each sensor.
+        path: ``.csv`` or ``.txt`` with a row for each time or each reading, ``.json`` of Sensor Logger, ``.jsonl`` of
+            Spectacular AI, or a folder with a file for each sensor.
         rough: as they stand, for a check: neither sorted nor refused, and numbers whose unit is not stated or clear are
             left as they are.
 
@@ -269,9 +272,83 @@ def _float(cell: str) -> float:
 
 def _of_text(path: Path, rough: bool) -> tuple[dict[str, _Sensor], list[str]]:
     """Sensors in a text file, and notes."""
-    text = _text(path)
-    if not len(text.table):
-        raise DvoError("no rows in it", file=path, field="imu", remedy=REMEDY)
+    about: dict[str, str] = {}
+    if path.suffix.lower() == ".json":
+        header, rows, about = read_json(path)
+        parts, text = by_sensor(header, rows), _Text(header, np.zeros((0, 0)), rows, [])
+        if not parts:
+            message = "no readings of a gyroscope or an accelerometer with x, y and z"
+            raise DvoError(message, file=path, field="sensor", remedy=JSON_REMEDY)
+    else:
+        text = _text(path)
+        parts = by_sensor(text.header, text.rows)
+        if not len(text.table):
+            raise DvoError("no rows in it", file=path, field="imu", remedy=REMEDY)
+    is_logger, is_long = SENSOR_LOGGER in text.header, bool(parts)
+    if is_logger and not is_long:
+        about = _metadata(path)
+        if path.stem == "Accelerometer":
+            files = [("Accelerometer", text)]
+            files += [("Gravity", _text(file)) for file in (path.with_name("Gravity.csv"),) if is_file(file)]
+            parts = [Readings.of(name, one.header, one.rows) for name, one in files]
+    found, notes = _of_readings(parts, path, rough) if parts else _of_columns(text, path, rough)
+    notes = [*text.notes, *notes] if parts else notes
+    if len(found) < 2 and is_long:
+        missing = "accelerometer" if "gyro" in found else "gyroscope"
+        there = ", ".join(part.name for part in parts)[:100]
+        raise DvoError(f"no readings of the {missing}, but of {there}", file=path, field="sensor", remedy=REMEDY)
+    if is_logger and "accel" in found:
+        if about.get("platform", "").lower() == "ios" and about.get("standardisation", "").lower() != "true":
+            found["accel"] = replace(found["accel"], values=-found["accel"].values)
+            notes.append(f"{path.name}: the sign of the accelerometer is Apple's and was changed")
+        elif "platform" not in about and (parts or path.stem == "AccelerometerUncalibrated"):
+            told = "the sign of the accelerometer is taken for Android's (dvo imu check compares it with the camera)"
+            notes.append(f"{path.name}: no platform is stated: {told}")
+    return found, notes
+
+
+def _metadata(path: Path) -> dict[str, str]:
+    """What Sensor Logger tells of a recording beside its files: names and values."""
+    file = path.with_name("Metadata.csv")
+    lines = [line for _, line in read_lines(file, REMEDY, "imu")] if is_file(file) else []
+    return {name.strip(): value.strip() for row in list(csv.DictReader(lines))[:1] for name, value in row.items()
+            if isinstance(name, str) and isinstance(value, str)}  # fmt: skip
+
+
+def _of_readings(parts: Sequence[Readings], path: Path, rough: bool) -> tuple[dict[str, _Sensor], list[str]]:
+    """Sensors that have rows of their own, and notes."""
+
+    def of(part: Readings) -> tuple[_Sensor, list[str]]:
+        table = np.array([[_float(cell) for cell in row] for row in part.rows], dtype=np.float64)
+        sensors, told = _of_columns(_Text(part.header, table, part.rows, []), path, rough)
+        return next(iter(sensors.values())), told
+
+    found: dict[str, _Sensor] = {}
+    notes = []
+    kinds = {kind: sorted((part for part in parts if part.kind == kind), key=lambda part: part.rank)
+             for kind in ("gyro", "accel", "linear", "gravity")}  # fmt: skip
+    for kind in ("gyro", "accel"):
+        if kinds[kind]:
+            first, *others = kinds[kind]
+            found[kind], told = of(first)
+            notes += told
+            if others:
+                rivals = ", ".join(part.name for part in others)
+                notes.append(f"{path.name}: {first.name} is taken for the {_noun(kind)}, not {rivals}"[:200])
+    if kinds["linear"] and not kinds["accel"]:
+        name = kinds["linear"][0].name
+        if not kinds["gravity"]:
+            raise DvoError(f"gravity was removed from {name}", file=path, field="accel", remedy=_NO_GRAVITY)
+        (moved, told), (down, _) = of(kinds["linear"][0]), of(kinds["gravity"][0])
+        times, values = _ordered(down.times, down.values)
+        at = [np.interp(moved.times, times, column, np.nan, np.nan) for column in values.T]
+        found["accel"] = replace(moved, values=moved.values + np.stack(at, axis=1))
+        notes += [*told, f"{path.name}: the accelerometer is the sum of {name} and {kinds['gravity'][0].name}"]
+    return found, list(dict.fromkeys(notes))
+
+
+def _of_columns(text: _Text, path: Path, rough: bool) -> tuple[dict[str, _Sensor], list[str]]:
+    """Sensors in the columns of a table, and notes."""
     if not text.header:
         return _unnamed(text, path, rough)
     kept, note = first_instance(text.header, text.rows)
@@ -342,8 +419,13 @@ def _in_seconds(
             values.append(None)
     known = [value for value in values if value is not None]
     if 2 * len(known) <= len(values):
-        message = f"times that are no numbers, such as {cells[0][:40]}"
-        raise DvoError(message, file=path, field="time", remedy="give times in seconds to the millisecond, or finer")
+        dates = [parse_date(cell) for cell in cells]
+        if 2 * sum(date is not None for date in dates) <= len(dates):
+            message = f"times that are neither numbers nor dates, such as {cells[0][:40]}"
+            remedy = "give times in seconds to the millisecond, or finer, or dates such as 2024-05-01T12:00:00.123Z"
+            raise DvoError(message, file=path, field="time", remedy=remedy)
+        values, known, unit = list(dates), [date for date in dates if date is not None], "s"
+        units = PARTS
     clock = _Clock.of(known, units)
     notes = []
     if unit is None:

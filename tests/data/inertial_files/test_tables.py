@@ -242,7 +242,7 @@ def test_a_clock_of_whole_seconds_is_refused():
     file = data_root() / "phone_desk_198" / "imu.csv"
     if not file.is_file():
         pytest.skip("no shared data")
-    with pytest.raises(DvoError, match="times that are no numbers, such as 15-23-14"):
+    with pytest.raises(DvoError, match="times that are neither numbers nor dates, such as 15-23-14"):
         read_inertial_table(file)
 
 

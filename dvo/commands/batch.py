@@ -9,7 +9,6 @@ import shlex
 import shutil
 import signal
 import sys
-import tempfile
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
@@ -42,6 +41,7 @@ from dvo.core.errors import DvoError
 from dvo.core.processes import Ending, StoppedError, run_limited
 from dvo.core.text import first_line, print_line, visible
 from dvo.core.threads import process_environment, share_cores
+from dvo.data.files.output import scratch_folder
 from dvo.data.readers.rosbag import split_topic
 from dvo.data.streams.capture import is_stream
 from dvo.export.formats import check_formats
@@ -396,8 +396,7 @@ def track_packed(job: Job) -> bytes:
         For :func:`dvo.core.cluster.unpack`.
     """
     processes.begin()
-    with tempfile.TemporaryDirectory(prefix="dvo-batch-") as place:
-        folder = Path(place)
+    with scratch_folder("dvo-batch") as folder:
         ending = run_one(job, folder / _RESULTS, folder / _LOG)
         code = "" if ending.code is None else str(ending.code)
         (folder / _CODE).write_text(f"{code}\n{_error_line(folder / _LOG, ending)}\n", encoding="utf-8")
@@ -407,8 +406,7 @@ def track_packed(job: Job) -> bytes:
 def _stored(job: Job, content: bytes, out: Path) -> Row:
     """Put what a node has packed into the folder of results, with the checks of ``dvo run``; gives the row."""
     try:
-        with tempfile.TemporaryDirectory(prefix=".part-", dir=out) as place:
-            unpacked = Path(place)
+        with scratch_folder(job.name, out) as unpacked:
             cluster.unpack(content, unpacked)
             code, _, error = (unpacked / _CODE).read_text(encoding="utf-8").partition("\n")
             os.replace(unpacked / _LOG, out / LOGS / f"{job.name}.log")

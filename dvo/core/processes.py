@@ -1,18 +1,24 @@
-"""Programs with a time limit, ended together with whatever they have started."""
+"""Programs that end when their time is out, with whatever they have started, or with the process that starts them."""
 
 from __future__ import annotations
 
-import ctypes
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 _FOREVER = 1e9  # seconds
+_BOUND = (
+    "import ctypes, os, sys\n"
+    "ctypes.CDLL(None).prctl(1, 9, 0, 0, 0)\n"  # PR_SET_PDEATHSIG, SIGKILL
+    "if os.getppid() == int(sys.argv[1]): os.execvp(sys.argv[2], sys.argv[2:])"  # else it was too late
+)
 _running: set[subprocess.Popen[bytes]] = set()
 _lock = threading.RLock()  # a handler of a signal may take it while its thread has it
 _closed = threading.Event()
@@ -106,10 +112,29 @@ def begin() -> None:
     _ended.clear()
 
 
+def bound(command: Sequence[str]) -> list[str]:
+    """Command of a program that ends when the thread which starts it is gone, even if that is killed (Linux).
+
+    A process between asks the kernel for it, and becomes the program. Elsewhere it is the same command.
+
+    Args:
+        command: program and arguments.
+    """
+    before = [sys.executable, "-I", "-S", "-c", _BOUND, str(os.getpid())] if sys.platform == "linux" else []
+    return [*before, *command]
+
+
 def die_with_parent() -> None:
-    """Ask the kernel to end this process when its parent dies (Linux; nothing elsewhere)."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG
+    """End this process of :mod:`multiprocessing` at once when the one that has started it is gone, even if killed."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)  # a thread cannot end the process in another way
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def stop_with_parent(parent: int) -> None:

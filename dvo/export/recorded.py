@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -14,6 +13,7 @@ import cv2
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import scratch_folder
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.export.reconstruction import TIME_ROUNDING, Reconstruction
@@ -82,8 +82,8 @@ def recorded_images(
     Raises:
         DvoError: no frame has a pose.
     """
-    with tempfile.TemporaryDirectory(prefix="dvo-images-") as folder:
-        jpegs, masks = _Files(Path(folder), ".jpg"), _Files(Path(folder), ".png")
+    with scratch_folder("dvo-images") as folder:
+        jpegs, masks = _Files(folder, ".jpg"), _Files(folder, ".png")
         cameras: list[Camera] = []
         rows, identifiers, owners = [], [], []
         has_mask = False

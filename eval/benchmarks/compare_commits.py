@@ -18,7 +18,6 @@ import re
 import statistics
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -26,6 +25,8 @@ from pathlib import Path
 
 from dvo.core.command_line import OneLineParser, positive_int
 from dvo.core.errors import DvoError
+from dvo.core.processes import bound
+from dvo.data.files.output import scratch_folder
 from dvo.data.files.root import data_root
 from eval.suites.suite import ROOT
 
@@ -93,8 +94,8 @@ def worktree(revision: str, repository: Path = ROOT) -> Iterator[Path]:
     Raises:
         DvoError: git is not installed, or does not find the commit.
     """
-    with tempfile.TemporaryDirectory(prefix="dvo-base-") as folder:
-        place = Path(folder) / "tree"
+    with scratch_folder("dvo-base") as folder:
+        place = folder / "tree"
         _git(repository, "worktree", "add", "--detach", str(place), revision)
         try:
             yield place
@@ -135,7 +136,7 @@ class _Steps:
         self.tree = tree
         command, pipe = [sys.executable, SCRIPT, "training", "--threads", str(threads)], subprocess.PIPE
         environment = _environment(tree, threads)
-        self.process = subprocess.Popen(command, cwd=tree, env=environment, text=True, stdin=pipe, stdout=pipe)
+        self.process = subprocess.Popen(bound(command), cwd=tree, env=environment, text=True, stdin=pipe, stdout=pipe)
         self._answer("READY")
 
     def step(self) -> Cost:
@@ -246,7 +247,7 @@ def same_trajectories(base: Path, current: Path, settings: Settings) -> dict[str
         Clip name to True if the trajectories are equal.
     """
     found = {}
-    with tempfile.TemporaryDirectory(prefix="dvo-tracks-") as folder:
+    with scratch_folder("dvo-tracks") as folder:
         for name in settings.clips:
             clip = settings.data / name
             one, two = (
@@ -258,7 +259,7 @@ def same_trajectories(base: Path, current: Path, settings: Settings) -> dict[str
 
 
 def _run(command: list[str], tree: Path, threads: int) -> str:
-    done = subprocess.run(command, cwd=tree, env=_environment(tree, threads), capture_output=True, text=True)
+    done = subprocess.run(bound(command), cwd=tree, env=_environment(tree, threads), capture_output=True, text=True)
     if done.returncode:
         last = (done.stderr.strip().splitlines() or [f"exit {done.returncode}"])[-1]
         raise DvoError(f"{' '.join(command[1:4])} failed: {last}", file=tree, remedy="run it there by hand")

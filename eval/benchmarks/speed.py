@@ -19,7 +19,6 @@ import json
 import os
 import statistics
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -28,8 +27,9 @@ import numpy as np
 
 from dvo.core.command_line import OneLineParser, names, positive_int
 from dvo.core.errors import DvoError
-from dvo.core.processes import run_limited
+from dvo.core.processes import bound, run_limited
 from dvo.core.threads import process_environment
+from dvo.data.files.output import scratch_folder
 from eval.benchmarks.timed_run import KINDS, Job, Timed
 from eval.suites.selection import folder_of_data, load_suites, settle, suite_of_folder
 from eval.suites.suite import ROOT, Suite, suite_names
@@ -77,13 +77,12 @@ def run_once(job: Job) -> Timed:
     Raises:
         DvoError: the run failed.
     """
-    with tempfile.TemporaryDirectory(prefix="dvo-speed-") as name:
-        folder = Path(name)
+    with scratch_folder("dvo-speed") as folder:
         files = [folder / "job.json", folder / "result.json"]
         files[0].write_text(json.dumps(asdict(job)), encoding="utf-8")
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
         command = [sys.executable, "-m", "eval.benchmarks.timed_run", *map(str, files)]
-        ending = run_limited(command, process_environment(1, environment), None, folder / "log.txt")
+        ending = run_limited(bound(command), process_environment(1, environment), None, folder / "log.txt")
         if not files[1].is_file():
             raise DvoError(f"failed: {ending}", field=job.system, remedy="run it by: python -m eval run")
         return Timed(**json.loads(files[1].read_text(encoding="utf-8")))

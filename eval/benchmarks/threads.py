@@ -25,6 +25,7 @@ from pathlib import Path
 
 from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
+from dvo.core.processes import bound
 from dvo.core.threads import available_cores
 from dvo.data.files.root import data_root
 from eval.suites.suite import ROOT
@@ -104,7 +105,7 @@ def busy_processes(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
     running: list[subprocess.Popen[bytes]] = []
     try:
         for _ in range(count):
-            running.append(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
+            running.append(subprocess.Popen(bound([sys.executable, "-c", "while True: pass"])))
         yield running
     finally:
         for process in running:
@@ -126,7 +127,7 @@ def measure(case: Case, options: list[str]) -> Speed:
         DvoError: the process failed.
     """
     command = [sys.executable, str(_SCRIPT), *options, *(["--before"] if case.before else [])]
-    done = subprocess.run(command, env=environment_of(case, os.environ), capture_output=True, text=True)
+    done = subprocess.run(bound(command), env=environment_of(case, os.environ), capture_output=True, text=True)
     found = _SPEED.search(done.stdout)
     if done.returncode or found is None:
         last = (done.stderr.strip().splitlines() or [f"exit {done.returncode}"])[-1]

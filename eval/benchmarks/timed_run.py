@@ -21,7 +21,6 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from dvo.core.allocator import reuse_freed_memory
-from dvo.core.processes import die_with_parent
 from dvo.core.threads import settle_threads
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
@@ -220,7 +219,6 @@ def main(job: str, result: str) -> None:
         job: JSON form of a :class:`Job`.
         result: file for that of a :class:`Timed`.
     """
-    die_with_parent()
     entry = json.loads(Path(job).read_text(encoding="utf-8"))
     found = measure(Job(**{**entry, "sequence": sequence_from(entry["sequence"])}))
     Path(result).write_text(json.dumps(asdict(found)), encoding="utf-8")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from dvo.core import cluster
+from dvo.data.files.output import scratch_folder
 from eval.execution.cache import commit, part_folder
 from eval.execution.predict import Job, Prediction, predict, read_prediction
 from eval.suites.suite import ROOT
@@ -31,8 +31,8 @@ def run_on_ray(jobs: list[tuple[Job, dict[str, Any]]], address: str) -> Iterator
 
 def run_packed(job: Job) -> bytes:
     """On the node: run a job in a folder of its own and pack what it leaves."""
-    with tempfile.TemporaryDirectory(prefix="dvo-eval-") as folder:
-        place = Path(folder) / "run"
+    with scratch_folder("dvo-eval") as folder:
+        place = folder / "run"
         predict(replace(job, folder=str(place)))
         return cluster.packed(place)
 

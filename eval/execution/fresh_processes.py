@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import TypeVar
 
+from dvo.core.processes import die_with_parent
 from dvo.core.threads import settle_threads
 
 Task = TypeVar("Task")
@@ -16,7 +17,7 @@ Done = TypeVar("Done")
 def in_fresh_processes(
     work: Callable[[Task], Done], tasks: Sequence[Task], *, jobs: int = 1, each: int = 1
 ) -> Iterator[Done]:
-    """Results of a function on tasks, in their order, from processes that end after some tasks.
+    """Results of a function on tasks, in their order, from processes that end after some tasks, or with this one.
 
     ``max_tasks_per_child`` of the pool is not used: Python 3.11 stops for ever where a process has had its share.
 
@@ -34,5 +35,10 @@ def in_fresh_processes(
     """
     share = jobs * each
     for begin in range(0, len(tasks), share):
-        with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), settle_threads) as pool:
+        with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _begin) as pool:
             yield from pool.map(work, tasks[begin : begin + share])
+
+
+def _begin() -> None:
+    die_with_parent()
+    settle_threads()

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.core.processes import run_limited
+from dvo.core.processes import bound, run_limited
 from dvo.core.threads import process_environment
 from dvo.data.files.output import write_text
 from dvo.data.frame import Frame
@@ -131,7 +131,7 @@ def predict(job: Job) -> Prediction:
     (folder / "job.json").write_text(json.dumps(asdict(job), indent=1), encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, "-m", "eval.execution.worker", str(folder / "job.json")]
-    ending = run_limited(command, process_environment(job.threads, environment), job.time_limit, folder / LOG)
+    ending = run_limited(bound(command), process_environment(job.threads, environment), job.time_limit, folder / LOG)
     if ending.code is None:
         late = Prediction("timeout", f"not done after {job.time_limit:g} s", system.version())
         return write_prediction(job, late)

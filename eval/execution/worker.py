@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 
-from dvo.core.processes import die_with_parent
 from eval.execution.predict import Job, predict_here
 from eval.suites.selection import sequence_from
 
@@ -20,7 +19,6 @@ def main(path: str) -> None:
     Args:
         path: JSON form of a :class:`eval.execution.predict.Job`.
     """
-    die_with_parent()
     entry = json.loads(Path(path).read_text(encoding="utf-8"))
     job = Job(**{**entry, "sequence": sequence_from(entry["sequence"])})
     cv2.setNumThreads(job.threads)

@@ -105,6 +105,32 @@ def spelled_in_text(path: Path) -> Iterator[str]:
         yield str(link)
 
 
+@contextlib.contextmanager
+def scratch_folder(name: str, place: Path | None = None) -> Iterator[Path]:
+    """Folder for files of this process, which goes at the end of the block.
+
+    One that a process has left behind when it was killed goes when the next one is made in the same place.
+
+    Args:
+        name: end of its name.
+        place: where it lies; None for where temporary files do.
+
+    Yields:
+        The folder; other users cannot look into it.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    place = Path(tempfile.gettempdir()) if place is None else place
+    sweep_parts(place)
+    folder = place / _part_name(Path(name))
+    folder.mkdir(mode=0o700)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def begin_part(path: Path | str) -> Path:
     """Name of a new part of a file, for content that is written over a longer time; see :func:`replaced`.
 

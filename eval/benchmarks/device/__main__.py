@@ -24,7 +24,6 @@ import platform
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -34,8 +33,9 @@ import torch
 from dvo.core.arguments import checked_device
 from dvo.core.command_line import OneLineParser, names, positive_float
 from dvo.core.errors import DvoError
+from dvo.core.processes import bound
 from dvo.core.threads import settle_threads
-from dvo.data.files.output import write_text
+from dvo.data.files.output import scratch_folder, write_text
 from eval.benchmarks.device.rows import Row, append_row, failures, read_rows, reason_of, table
 from eval.benchmarks.device.sections import SECTIONS, Setting
 from eval.suites.suite import ROOT
@@ -53,12 +53,12 @@ def run_section(name: str, device: str, seconds: float, quick: bool) -> list[Row
         seconds: that it may take.
         quick: tiny sizes.
     """
-    with tempfile.TemporaryDirectory(prefix="dvo-device-") as folder:
-        file, said = Path(folder) / "rows", Path(folder) / "said"
+    with scratch_folder("dvo-device") as folder:
+        file, said = folder / "rows", folder / "said"
         command = [sys.executable, "-m", "eval.benchmarks.device", "--device", device, "--section", name]
         command += ["--rows", str(file), "--seconds", str(max(1.0, seconds - START)), *(["--quick"] if quick else [])]
         with said.open("wb") as output:
-            process = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=output, start_new_session=True)
+            process = subprocess.Popen(bound(command), cwd=ROOT, stdout=output, stderr=output, start_new_session=True)
             try:
                 code: int | None = process.wait(seconds)
             except subprocess.TimeoutExpired:

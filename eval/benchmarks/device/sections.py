@@ -18,6 +18,7 @@ import torch
 
 from dvo.core.errors import DvoError
 from dvo.core.kernels import CHOICES, VARIABLE, use_device_kernels
+from dvo.core.processes import bound
 from dvo.core.yaml_files import read_yaml
 from dvo.data.frame import Frame
 from dvo.models.weights import FOLDER, LoadedWeights, load_weights
@@ -89,7 +90,8 @@ def tests(given: Setting) -> Iterator[Row]:
     """
     command = [sys.executable, "-m", "pytest", "-v", "-n", "0", "-p", "no:cacheprovider", "--color=no"]
     command += ["-m", "gpu and not slow" if given.quick else "gpu", "--device", str(given.device), "tests/gpu"]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+    pipe, both = subprocess.PIPE, subprocess.STDOUT
+    with subprocess.Popen(bound(command), cwd=ROOT, stdout=pipe, stderr=both, text=True) as process:
         assert process.stdout is not None
         last, seen, before = "", 0, time.perf_counter()
         for line in process.stdout:

@@ -24,6 +24,7 @@ import torch
 import dvo
 from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
+from dvo.core.processes import die_with_parent
 from dvo.data.files.root import data_root
 from dvo.data.trajectory import Trajectory
 from dvo.odometry.protocol import Estimate, Odometry
@@ -122,7 +123,12 @@ def _forked(work: Callable[[], Score]) -> Score:
     """Run a function in a forked process, which changes nothing in this one."""
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=lambda: sender.send(work()))
+
+    def carry_out() -> None:
+        die_with_parent()
+        sender.send(work())
+
+    process = context.Process(target=carry_out)
     process.start()
     sender.close()
     try:

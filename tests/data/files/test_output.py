@@ -98,6 +98,28 @@ def test_parts_of_dead_processes_go_with_the_next_write_and_no_others(tmp_path):
     assert not part.exists() and own.exists()
 
 
+@pytest.mark.skipif(os.name != "posix", reason="processes cannot be asked for")
+def test_folders_of_killed_processes_go_with_the_next_one(tmp_path, monkeypatch):
+    """In the place of temporary files; those of other programs stay, and that of a process that lives."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", "import time; from dvo.data.files.output import scratch_folder\n"
+         "with scratch_folder('dvo-batch') as folder:\n    (folder / 'x').mkdir(); print(folder, flush=True);"
+         " time.sleep(600)"],
+        stdout=subprocess.PIPE, text=True, env={**os.environ, "TMPDIR": str(tmp_path)},
+    )  # fmt: skip
+    left = Path(process.stdout.readline().strip())
+    assert left.parent == tmp_path and left.stat().st_mode & 0o777 == 0o700
+    (tmp_path / "dvo-batch-mine").mkdir()
+    monkeypatch.setattr(output.tempfile, "gettempdir", lambda: str(tmp_path))
+    with output.scratch_folder("dvo-batch") as folder:
+        assert folder.is_dir() and left.is_dir(), "its process is alive"
+    process.kill()
+    process.wait()
+    with output.scratch_folder("dvo-batch") as folder:
+        assert folder.is_dir() and not left.exists()
+    assert [child.name for child in tmp_path.iterdir()] == ["dvo-batch-mine"]
+
+
 def test_a_part_of_another_machine_goes_when_it_is_old(tmp_path):
     for name, age in (("new", 60), ("old", 2 * output.ABANDONED)):
         part = tmp_path / f".part-00000000-1-00000000-0-{name}"

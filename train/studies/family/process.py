@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import sys
-import threading
 from collections.abc import Callable
 from typing import Any
 
 from dvo.core.errors import DvoError
+from dvo.core.processes import die_with_parent
 from dvo.core.text import print_line
 
 
@@ -38,20 +37,13 @@ def apart(function: Callable[..., None], *arguments: Any) -> None:
 
 
 def _run(function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    die_with_parent()  # states are written as a whole
     use_one_thread()
     try:
         function(*arguments)
     except DvoError as error:
         print_line(f"error: {error}", error=True)
         sys.exit(2)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)  # a thread cannot end the process in another way; states are written as a whole
 
 
 def use_one_thread() -> None:

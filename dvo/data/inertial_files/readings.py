@@ -100,12 +100,12 @@ def by_sensor(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Read
     for row in rows:
         sensors.setdefault(row[columns[0]].strip(), []).append(list(row))
     unit = next((k for k, name in enumerate(plain) if name in ("unit", "units")), None)
-    found = []
+    tables = []
     for name, mine in sensors.items():
         units = {row[unit].strip() for row in mine} if unit is not None else set()
         if kind_of(name):
-            found.append(Readings.of(name, header, mine, units.pop() if len(units) == 1 else ""))
-    return found
+            tables.append(Readings.of(name, header, mine, ",".join(sorted(units))))
+    return tables
 
 
 def read_json(path: Path) -> tuple[list[str], list[list[str]], dict[str, str]]:

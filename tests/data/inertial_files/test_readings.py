@@ -88,6 +88,15 @@ def there(k: int, hours: float) -> datetime:
     return date(k).astimezone(timezone(timedelta(hours=hours)))
 
 
+def test_a_unit_that_changes_is_refused(tmp_path):
+    def row(name: str, k: int, *xyz: float) -> str:
+        return cells(name, NS[k], *xyz, "rad/s" if name == "gyro" else ("g", "mg")[k % 2])
+
+    file = long(tmp_path, "name,time,x,y,z,unit", {"gyro": GYRO, "acc": ACCEL}, row)
+    with pytest.raises(DvoError, match="accel: the unit g,mg is not known. Name one of m/s"):
+        read_inertial_table(file)
+
+
 DATES = {
     "UTC": lambda k: date(k).isoformat().replace("+00:00", "Z"),
     "none": lambda k: date(k).strftime("%Y-%m-%d %H:%M:%S.%f"),

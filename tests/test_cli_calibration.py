@@ -102,6 +102,8 @@ def test_what_was_found_in_images_stays_so_in_a_file(image_folder, tmp_path, cal
     out = tmp_path / "out"
     assert main(["run", str(image_folder), "--out", str(out)]) == 0
     assert not dvo.open(image_folder, calib=out / "calib.txt").calibrated
+    found = SelfCalibration(51.0, 1.5, "self-calibration", 64, 48, 20, "", guess_from_angle(64, 48))
+    assert not dvo.open(image_folder, calib=found.calibration).calibrated
     (out / "calib.txt").write_text("51 51 31.5 23.5\n")
     assert dvo.open(image_folder, calib=out / "calib.txt").calibrated
 

@@ -48,7 +48,7 @@ class Calibration:
         depth_scale: units of a metre in depth images of integers that belong to the images.
         baseline: metres from the camera to the right camera of a rectified pair with the same intrinsics.
         readout: seconds in which a rolling shutter reads the rows, as in :class:`dvo.geometry.camera.Camera`.
-        was_found: it is from a file whose focal length dvo has found in the images of a clip (:data:`FOUND_BY_DVO`).
+        was_found: dvo has found it in the images of a clip, as the file may say (:data:`FOUND_BY_DVO`).
         dialect: form of the file that it was read from.
         ignored: keys of the file that were not used.
         notes: what the user has to know about the file, in sentences; :meth:`doubts` has them too.

@@ -60,7 +60,7 @@ class SelfCalibration:
     @property
     def calibration(self) -> Calibration:
         """Square pixels, the principal point at the centre and no distortion, or what was found of them."""
-        return simple_camera(self.focal, self.aside, self.bend, self.width, self.height)
+        return replace(simple_camera(self.focal, self.aside, self.bend, self.width, self.height), was_found=True)
 
     def __str__(self) -> str:
         """Sentence for people."""

@@ -52,6 +52,8 @@ ANOTHER_CLOCK = 86400.0
 """Seconds between a sample and the newest frame that are no pause and no delay."""
 MOST_NODES = 400
 """Nodes of the estimate at the end of a sequence."""
+SAME_TIME = 1e-6
+"""Seconds."""
 
 
 class InertialTracking:
@@ -81,16 +83,25 @@ class InertialTracking:
         # Squares, of errors of the gyroscope and of the motion model, and of turns between frames, rad^2.
         self._errors: tuple[float, float, float] | None = None
         self._turn: tuple[float, float, np.ndarray | None] | None = None  # newest by the gyroscope, between two times
-        self._read_at_once, self._readout = 0, 0.0  # frames, and seconds
+        self._at_once: list[float] = []  # times of frames that were read at once
+        self._readout = 0.0  # theirs, seconds
         self._last: tuple[float, np.ndarray] | None = None  # time and pose T_wc of the last frame with one
         self._before: tuple[float, np.ndarray] | None = None  # and of the one before it
         self._anchor: BodyState | None = None  # from which poses are predicted, while there are none by images
         self._state: BodyState | None = None  # the newest prediction
         self._way = 0.0  # metres since the alignment
 
-    def turns(self) -> Turns | None:
-        """Rotations by the gyroscope, for the readout of a rolling shutter; None if it does not tell them."""
-        return self.estimator.turns(self._nodes(-np.inf)[0]) if self.active else None
+    def turns(self, *, told: bool = False) -> Turns | None:
+        """Rotations during the readout of a rolling shutter: none in the images of frames that were read at once.
+
+        Args:
+            told: of other frames, what the gyroscope tells; otherwise they are not known.
+
+        Returns:
+            None if none are known.
+        """
+        found = self.estimator.turns(self._nodes(-np.inf)[0]) if self.active and told else None
+        return _turns_of(np.array(self._at_once), found) if self._at_once else found
 
     def read_at_once(self, admitted: Admitted) -> Admitted:
         """A frame of a rolling shutter without the turn during its readout, where the gyroscope has been right of late.
@@ -110,14 +121,15 @@ class InertialTracking:
         turns = self.estimator.turns_about(admitted.timestamp, offsets)
         if turns is None:
             return admitted
-        self._read_at_once, self._readout = self._read_at_once + 1, camera.readout
+        self._at_once.append(admitted.timestamp)
+        self._readout = camera.readout
         image = read_at_once(admitted.image, camera, offsets, turns)
         return replace(admitted, image=image, camera=replace(camera, readout=0.0))
 
     @property
     def readout(self) -> float:
         """Readout time that most frames so far have been corrected for, see :meth:`read_at_once`; 0: they have not."""
-        return self._readout if 2 * self._read_at_once > len(self.graph.log.frames) else 0.0
+        return self._readout if 2 * len(self._at_once) > len(self.graph.log.frames) else 0.0
 
     def add_apart(self, samples: InertialSamples) -> None:
         """Take samples that do not come with a frame.
@@ -523,6 +535,17 @@ def _path(smoothed: Smoothed, nodes: VisualNodes, mine: np.ndarray) -> _Path | N
     scale = np.exp(smoothed.log_scale[at])[:, None]
     translation = camera - scale * (rotation @ nodes.position[shared][..., None])[..., 0]
     return _Path(nodes.times[shared], smoothed.log_scale[at], matrix_to_quaternion(rotation), translation)
+
+
+def _turns_of(at_once: np.ndarray, told: Turns | None) -> Turns:
+    """Rotations during the readout: none at some times ``(K,)``, increasing, and at others what is told."""
+
+    def turns(times: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+        found = np.full((len(times), len(offsets), 3), np.nan) if told is None else told(times, offsets)
+        at = np.searchsorted(at_once, times - SAME_TIME).clip(max=len(at_once) - 1)
+        return np.where((np.abs(at_once[at] - times) <= SAME_TIME)[:, None, None], 0.0, found)
+
+    return turns
 
 
 def _spaced(times: np.ndarray, worlds: Sequence[int], spacing: float) -> list[int]:

@@ -61,8 +61,10 @@ def save_map(file: str | Path, odometry: SavedTracker) -> None:
     if not odometry.gate.finished and state.map is None:
         graph, loops, info = _closed(odometry)
     found = run_information(graph, state, odometry.config, loops, odometry.seed) | (info or {})
+    # Images that were read at once, with the gyroscope, are as those of a global shutter to a program without one.
+    readout = 0.0 if odometry.inertial.readout > 0 else state.shutter.readout
     table = state.map or MapTable(
-        odometry.name, odometry.seed, odometry.config, tuple(state.adjustable), state.shutter.readout,
+        odometry.name, odometry.seed, odometry.config, tuple(state.adjustable), readout,
         state.shutter.rows, {name: value for name, value in found.items() if name not in ("seed", "config")},
     )  # fmt: skip
     graph_table, arrays = graph_arrays(graph)

@@ -181,10 +181,11 @@ class PatchOdometry:
         """Process a frame that has passed the gate."""
         state = self.state
         record = self.graph.log.add(admitted.timestamp)
+        camera = admitted.camera
         if not (admitted.repeated or admitted.problem):
             admitted = self.inertial.read_at_once(admitted)
-        readout = 0.0 if self.inertial.readout > 0 else admitted.camera.readout
-        state.shutter = Shutter(readout, admitted.camera.height / self.model.config.STRIDE)
+        turns = self.inertial.turns() if camera.readout > 0 else None
+        state.shutter = Shutter(camera.readout, camera.height / self.model.config.STRIDE, turns)
         if admitted.repeated:
             estimate = self._repeat(record)
         else:
@@ -276,7 +277,7 @@ class PatchOdometry:
                 self._begin_segment()
             self._close_segment()
             self.loops.complete(state.adjustable)
-            state.shutter = replace(state.shutter, turns=self.inertial.turns())
+            state.shutter = replace(state.shutter, turns=self.inertial.turns(told=True))
             readout = self.inertial.readout
             config = replace(self.config, estimate_readout=self.config.estimate_readout and readout == 0)
             state.info |= finish_segments(self.graph, state, config, self.loops)

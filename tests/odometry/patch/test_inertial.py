@@ -8,6 +8,8 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
@@ -17,7 +19,7 @@ from dvo.geometry.poses import rotation_vector, so3_exp, split
 from dvo.odometry.global_ba.graph_adjustment import Adjusted
 from dvo.odometry.inertial.estimator import Similarity
 from dvo.odometry.inertial.smoother import GRAVITY, Similarities, Smoothed
-from dvo.odometry.patch.inertial import _led, _runs, _spaced
+from dvo.odometry.patch.inertial import _led, _runs, _spaced, _turns_of
 from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Estimate, ScaleState, Status
 from tests.support.tiny_tracker import SMALL, frames, plain, tracker
@@ -83,9 +85,22 @@ def test_a_rolling_shutter_is_corrected_where_the_gyroscope_has_told_the_turns(e
     for frame in with_samples(frames(8)):
         odometry.track(replace(frame, camera=replace(frame.camera, readout=0.02)))
         odometry.inertial._errors = error**2, 0.02**2, 0.02**2
-    assert (odometry.state.shutter.readout == 0.0) == (source == "gyroscope")
+    shutter, times = odometry.state.shutter, np.array([odometry.graph.log.frames[-1].timestamp])
+    turned = None if shutter.turns is None else shutter.turns(times, np.array([-0.01, 0.01]))
+    assert shutter.readout == 0.02 and (turned is not None) == (source == "gyroscope")
+    assert turned is None or not turned.any()  # the camera moves during the readout, and turns no more
     info = odometry.finish().info
     assert (info["readout"], info["readout_from"]) == (0.02, source)
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=8), st.booleans())
+def test_images_that_were_read_at_once_do_not_turn_and_others_do_as_is_told(at_once: list[bool], known: bool) -> None:
+    times, mask = 100.0 + 0.05 * np.arange(len(at_once)), np.array(at_once)
+    assume(mask.any())
+    turned = np.random.default_rng(0).normal(size=(len(times), 5, 3))
+    turns = _turns_of(times[mask], (lambda _, __: turned) if known else None)(times + 1e-9, np.zeros(5))
+    assert turns.shape == turned.shape and not turns[mask].any()
+    assert np.array_equal(turns[~mask], turned[~mask]) if known else np.isnan(turns[~mask]).all()
 
 
 def test_samples_are_ignored_on_request() -> None:

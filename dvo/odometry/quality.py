@@ -22,8 +22,8 @@ LEAST_AGREEMENT = 0.835
 the two lack adds up (:func:`lacks`)."""
 LEAST_TRACKED = 0.5
 """Share of frames with a pose below which a result is doubtful."""
-CHECK_CAMERA, RUN_AGAIN = 0.1, 0.25
-"""Lack of agreement, of what makes a result doubtful, above which it is asked for its camera, and run again."""
+RUN_AGAIN = 0.25
+"""Lack of agreement, of what makes a result doubtful, above which the sequence is run again."""
 MAX_SHIFT_GAIN = 0.4
 """Share of the cost of the followed corners of a pair of images that a shift explains, upper quartile of the pairs,
 above which the crop of the picture floats (:mod:`dvo.odometry.checks.floating_crop`)."""
@@ -128,17 +128,16 @@ def lacks(quality: Quality) -> tuple[float, float]:
     return quality.deviation / MOST_DEVIATION, (1 - quality.agreement) / (1 - LEAST_AGREEMENT)
 
 
-def leaves_doubt(quality: Quality | None, above: float = RUN_AGAIN) -> bool:
+def leaves_doubt(quality: Quality | None) -> bool:
     """Tell if a result is worth a closer look.
 
     Args:
         quality: of the result; None if it is not known.
-        above: lack of agreement.
 
     Returns:
         True for a good result that is not far from a doubtful one.
     """
-    return quality is not None and quality.verdict == "good" and sum(lacks(quality)) > above
+    return quality is not None and quality.verdict == "good" and sum(lacks(quality)) > RUN_AGAIN
 
 
 def judge(quality: Quality, frames: int, cause: str = "") -> tuple[Verdict, str, str]:

@@ -16,12 +16,10 @@ from dvo.odometry.patch.state import TrackerState
 from dvo.odometry.protocol import Result
 from dvo.odometry.quality import (
     CALIBRATE,
-    CHECK_CAMERA,
     MAX_SHIFT_GAIN,
     WRONG_BEND,
     WRONG_FOCAL,
     Quality,
-    leaves_doubt,
 )
 from dvo.odometry.scale.metric_scale import settle_scale
 
@@ -54,9 +52,10 @@ def finish_segments(
 def judge_result(
     graph: KeyframeGraph, result: Result, state: TrackerState, config: TrackerConfig, stride: int
 ) -> Quality:
-    """Quality of the result of a finished sequence; one that leaves doubt is asked for its camera too.
+    """Quality of the result of a finished sequence; a good one is asked for its camera too.
 
-    Distortion that is not in the calibration moves the corners as a crop that floats does.
+    Poses and depths can make up for a wrong lens, so that the measurements agree and nothing else tells it. Distortion
+    that is not in the calibration moves the corners as a crop that floats does.
 
     Args:
         graph: adjusted.
@@ -74,7 +73,7 @@ def judge_result(
     quality = measure_quality(
         graph, result, own, state.checks, stride=stride, shutter=shutter, first=state.started, fixed=state.hidden
     )
-    if not (own and (leaves_doubt(quality, CHECK_CAMERA) or quality.crop > MAX_SHIFT_GAIN)):
+    if not (own and (quality.verdict == "good" or quality.crop > MAX_SHIFT_GAIN)):
         return quality
     longest = max(own, key=lambda segment: len(graph.members(segment)))
     profile = find_focal(graph, longest, shutter, config.adjustment, beyond=WRONG_FOCAL)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import torch
 from torch import Tensor
 
 from dvo.ba.multistart import (
@@ -25,9 +26,10 @@ from dvo.models.step import Revision
 from dvo.odometry.depth.depth_factor import MEASURED_SHARE, match_window, measured_share
 from dvo.odometry.frames.content import NO_MATCH
 from dvo.odometry.patch.config import TrackerConfig
+from dvo.odometry.patch.initial_pose import predict_pose
 from dvo.odometry.uncertainty.uncertainty import has_second_solution
 from dvo.odometry.window.patch_window import PatchWindow
-from dvo.odometry.window.pose_validation import CONFIDENT, last_unrelated, measured, parallax
+from dvo.odometry.window.pose_validation import CONFIDENT, last_unrelated, measured, parallax, support_of
 
 MOVED_SHARE = 0.2
 """Share of the patches that have to move: the others may be far away, or fixed to the camera."""
@@ -180,6 +182,8 @@ def initialise_related(
 ) -> bool:
     """Optimise the first window without the frames that do not show the scene of the newest ones.
 
+    Frames that the first solution hardly finds begin once more where the motion of those before them leads them.
+
     Where frames are removed, the others begin anew: poses and depths that were fitted to another scene, or to noise,
     may be a minimum that they do not leave, and the test for motion needs equal poses.
 
@@ -197,7 +201,56 @@ def initialise_related(
     if drop_unrelated(graph, patch_window, config):
         graph.window.reset()
         enough = len(graph.window) >= config.initial_frames and initialise(patch_window, config, waited, beside)
+    elif (found := unsupported(graph.window, config)) and found[0] > 1:
+        before = graph.window.snapshot()
+        _continue_motion(graph.window, found[0])
+        again = initialise(patch_window, config, waited, beside)
+        if len(unsupported(graph.window, config)) < len(found):
+            enough = again
+        else:
+            graph.window.restore(before)
     return enough and len(graph.window) >= config.initial_frames
+
+
+def unsupported(window: Window, config: TrackerConfig) -> list[int]:
+    """Positions of the frames after the first that are hardly found in those before them: their poses are any.
+
+    Args:
+        window: after some steps.
+        config: least support, that of tracked frames.
+    """
+    least = config.lost_confidence, config.min_inliers
+    return [k for k in range(1, len(window)) if not support_of(window, k).reaches(*least)]
+
+
+def lose_unsupported(graph: KeyframeGraph, config: TrackerConfig) -> None:
+    """Remove the frames of the first window that are hardly found in those before them; they are lost.
+
+    Args:
+        graph: of the sequence; its window has just been initialised.
+        config: settings of the tracker.
+    """
+    for position in reversed(unsupported(graph.window, config)):
+        graph.log.lose(graph.discard(position).identifier, NO_MATCH)
+
+
+def _continue_motion(window: Window, first: int) -> None:
+    """Begin the frames from a position on anew, where the motion of those before it leads them.
+
+    In a fast turn they are too far from the equal poses that a first window begins with.
+    """
+    times = [frame.timestamp for frame in window.frames]
+    poses_cw = window.poses_cw.clone()
+    for k in range(first, len(window)):
+        poses_cw[k] = predict_pose(poses_cw[:k], times[:k], times[k], 1.0)
+    own = torch.arange(len(window.patches), device=poses_cw.device) // window.per_frame >= first
+    patches, touched = window.patches.clone(), (window.ii >= first) | (window.jj >= first)
+    patches[own, 2] = patches[~own, 2].median()
+    window.poses_cw, window.patches = poses_cw, patches
+    edges = window.hidden, window.targets, window.weights, window.confidence
+    window.hidden, window.targets, window.weights, window.confidence = (
+        torch.where(touched.view(-1, *[1] * (x.dim() - 1)), 0, x) for x in edges
+    )
 
 
 def drop_unrelated(graph: KeyframeGraph, patch_window: PatchWindow, config: TrackerConfig) -> bool:

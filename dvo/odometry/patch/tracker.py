@@ -40,7 +40,13 @@ from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.finishing import finish_segments, judge_result, run_information
 from dvo.odometry.patch.inertial import InertialTracking
 from dvo.odometry.patch.initial_pose import first_depth, first_pose
-from dvo.odometry.patch.initialisation import NOT_INITIALISED, first_motion, initialise_related, leave_minimum
+from dvo.odometry.patch.initialisation import (
+    NOT_INITIALISED,
+    first_motion,
+    initialise_related,
+    leave_minimum,
+    lose_unsupported,
+)
 from dvo.odometry.patch.kernels import load_in_background
 from dvo.odometry.patch.loops import loop_closer
 from dvo.odometry.patch.new_recording import begin_in_map
@@ -427,7 +433,10 @@ class PatchOdometry:
         if len(window) >= config.initial_frames:
             beside = self.loops.maintenance.helper
             enough = initialise_related(self.graph, self.patch_window, config, state.waited, beside)
+            if enough and support_of(window, len(window) - 1).reaches(config.lost_confidence, config.min_inliers):
+                lose_unsupported(self.graph, config)
             support = support_of(window, len(window) - 1)
+            enough = enough and len(window) >= config.initial_frames
             if enough and support.reaches(config.lost_confidence, config.min_inliers):
                 state.initialise(self.graph.segment)
                 if config.restart:

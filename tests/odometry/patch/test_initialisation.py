@@ -10,9 +10,18 @@ from dvo.ba.multistart import multistart, reversed_relief
 from dvo.ba.options import COLD_UPDATES
 from dvo.geometry import se3
 from dvo.odometry.depth.depth_factor import MEASURED_SHARE, measured_share
+from dvo.odometry.frames.content import NO_MATCH
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
+from dvo.odometry.patch import initialisation
 from dvo.odometry.patch.config import TrackerConfig
-from dvo.odometry.patch.initialisation import CALM, initialise, leave_minimum
+from dvo.odometry.patch.initialisation import (
+    CALM,
+    initialise,
+    initialise_related,
+    leave_minimum,
+    lose_unsupported,
+    unsupported,
+)
 from dvo.odometry.patch.state import RESTART_AGES, TrackerState
 from dvo.odometry.window.patch_window import StepSettings
 from tests.support.archived_walk import archived_walk, pose_at
@@ -104,3 +113,54 @@ def test_a_first_window_is_updated_until_it_has_settled(moving, unit):
     assert len(asked) == (not unit)
     settled = max(COLD_UPDATES, moving) + CALM
     assert len(updates) == min(settled, config.initial_updates)
+
+
+def _turning_window(frames=7, found=4):
+    """Graph whose window moves evenly; frames from one on have a pose that their measurements do not support."""
+    graph, _ = archived_walk(frames=frames, interval=0.03, archived=False)
+    window = graph.window
+    true, later = pose_at(0.03 * torch.arange(frames, dtype=torch.float64)).float(), torch.arange(frames) >= found
+    window.confidence = torch.where(later[window.ii] | later[window.jj], 0.0, 1.0)[:, None].expand_as(window.weights)
+    window.poses_cw = torch.where(later[:, None], true[:1], true)
+    return graph, true
+
+
+def test_frames_that_a_first_solution_hardly_finds_begin_where_the_motion_leads_them(monkeypatch):
+    (graph, true), starts = _turning_window(), []
+    measured = graph.window.targets, graph.window.patches
+
+    def solve(patch_window, *_):
+        starts.append(_error(patch_window.window.poses_cw, true))
+        if len(starts) > 1:
+            window = patch_window.window
+            window.confidence, window.poses_cw = torch.ones_like(window.confidence), true
+            window.targets, window.patches = measured
+        return True
+
+    monkeypatch.setattr(initialisation, "initialise", solve)
+    monkeypatch.setattr(initialisation, "drop_unrelated", lambda *_: False)
+    assert unsupported(graph.window, CONFIG) == [4, 5, 6]
+    assert initialise_related(graph, _step(graph.window), CONFIG, 0) and not unsupported(graph.window, CONFIG)
+    assert len(starts) == 2 and starts[1] < 0.2 * starts[0]
+
+
+def test_a_second_start_that_finds_no_more_frames_leaves_the_first_solution(monkeypatch):
+    graph, _ = _turning_window()
+    monkeypatch.setattr(initialisation, "initialise", lambda *_: True)
+    monkeypatch.setattr(initialisation, "drop_unrelated", lambda *_: False)
+    step, before = SimpleNamespace(window=graph.window), graph.window.snapshot()
+    assert initialise_related(graph, step, CONFIG, 0)
+    after = graph.window.snapshot()
+    assert all(torch.equal(getattr(before, name), getattr(after, name)) for name in ("poses_cw", "patches", "hidden"))
+
+
+def test_frames_of_the_first_window_that_nothing_supports_are_lost():
+    graph, _ = _turning_window(found=7)
+    window = graph.window
+    into = (window.jj == 3) | (window.ii == 3)
+    window.confidence = torch.where(into[:, None], 0.0, window.confidence)
+    identifiers = [frame.identifier for frame in window.frames]
+    lose_unsupported(graph, CONFIG)
+    assert [frame.identifier for frame in window.frames] == [*identifiers[:3], *identifiers[4:]]
+    lost = [record for record in graph.log.frames if record.lost]
+    assert [record.reason for record in lost] == [NO_MATCH] and len(graph.log.frames) == 7

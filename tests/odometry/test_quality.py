@@ -151,6 +151,9 @@ def test_jumps_are_counted():
     moved[10:, 1] += 30
     assert jumps(moved) == 1
     later = times.copy()
+    astray = poses.copy()
+    astray[4:6, 1] += 50.0, -50.0  # three steps in a row are far too long
+    assert jumps(astray) == 3
     later[10:] += 5.0  # a gap in time is no jump
     assert jumps(moved, later) == 0
     assert jumps(np.tile(poses[0], (20, 1))) == 0

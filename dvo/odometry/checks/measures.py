@@ -42,7 +42,9 @@ MOST_RELIEFS = 32
 MOST_TURNS = 8
 """The same of those that a turn of the camera is fitted to."""
 JUMP = 6.0
-"""Length of a step over the longer one of the steps before and after, and over the median, of a jump."""
+"""Length of a step over those before and after, the longer of their medians, and over the median of all, of a jump."""
+JUMP_STEPS = 5
+"""Steps before and after: a few poses in a row that are astray do not hide each other."""
 
 _Placed = tuple[CheckPair, np.ndarray, np.ndarray]
 
@@ -221,7 +223,7 @@ def _turns(graph: Map, numbers: Tensor, offsets: Tensor) -> Tensor:
 
 
 def count_jumps(result: Result) -> int:
-    """Number of steps between two frames that are far longer than those before and after.
+    """Number of steps between two frames that are far longer than most of those before and after.
 
     Args:
         result: of a sequence.
@@ -236,6 +238,10 @@ def count_jumps(result: Result) -> int:
         steps = np.linalg.norm(np.diff(rows.positions, axis=0), axis=1) / intervals
         if len(steps) < 5:
             continue
-        beside = np.maximum(np.r_[0, steps[:-1]], np.r_[steps[1:], 0])
+        none = np.full(JUMP_STEPS, np.nan)
+        around = np.lib.stride_tricks.sliding_window_view(np.r_[none, steps, none], 2 * JUMP_STEPS + 1)
+        before, after = around[:, :JUMP_STEPS].copy(), around[:, JUMP_STEPS + 1 :].copy()
+        before[0], after[-1] = 0, 0
+        beside = np.maximum(np.nanmedian(before, axis=1), np.nanmedian(after, axis=1))
         jumps += int((steps > JUMP * np.maximum(beside, np.median(steps))).sum())
     return jumps

@@ -30,7 +30,8 @@ def check_sensor(
             wrong.
         timestamps: ``(N,)`` increasing times of frames with a pose in one world, seconds; None without vision.
         rotations_wc: ``(N, 3, 3)`` their orientations, camera to world.
-        positions_wc: ``(N, 3)`` their places in any unit; None: the sign of the accelerometer is not checked.
+        positions_wc: ``(N, 3)`` their places in any unit; None: the sign of the accelerometer is not checked, and its
+            bias against what usual motion leaves.
 
     Returns:
         Numbers and findings.
@@ -46,8 +47,7 @@ def check_sensor(
     if timestamps is not None and rotations_wc is not None and len(timestamps) >= _MIN_FRAMES:
         alignment, found = check_against_vision(samples, timestamps, rotations_wc, positions_wc)
         values |= found.values
-        known = {finding.name for finding in findings}
-        findings += [finding for finding in found.findings if finding.name not in known]
+        findings = _joined(findings, found.findings)
     else:
         text = "time offset and axes are not checked without orientations of the camera"
         if timestamps is not None:
@@ -66,3 +66,10 @@ def check_sensor(
         findings.append(Finding("no noise", Level.NOTE, text, remedy))
     findings.sort(key=lambda finding: _GRAVITY.index(finding.level))
     return SensorReport(values, tuple(findings), alignment)
+
+
+def _joined(alone: list[Finding], seen: tuple[Finding, ...]) -> list[Finding]:
+    """Findings of the samples alone and of vision; of the same name those of vision only if they are graver."""
+    ranks = [{one.name: _GRAVITY.index(one.level) for one in part} for part in (seen, alone)]
+    graver = {name for name, rank in ranks[0].items() if rank < ranks[1].get(name, len(_GRAVITY))}
+    return [one for one in alone if one.name not in graver] + [one for one in seen if one.name in graver]

@@ -13,7 +13,6 @@ from dvo.odometry.inertial.findings import Finding, Level, SensorReport
 from dvo.odometry.inertial.sample_checks import check_axes, check_stamps, check_values
 from dvo.odometry.inertial.vision_checks import check_against_vision
 
-_GRAVITY = tuple(Level)  # the gravest first
 _MIN_FRAMES = 20
 
 
@@ -64,12 +63,11 @@ def check_sensor(
         text = "the noise of the sensor is not stated, that of a phone is assumed"
         remedy = "state noise, or a preset (euroc, action, phone), in --imu-calib"
         findings.append(Finding("no noise", Level.NOTE, text, remedy))
-    findings.sort(key=lambda finding: _GRAVITY.index(finding.level))
     return SensorReport(values, tuple(findings), alignment)
 
 
 def _joined(alone: list[Finding], seen: tuple[Finding, ...]) -> list[Finding]:
     """Findings of the samples alone and of vision; of the same name those of vision only if they are graver."""
-    ranks = [{one.name: _GRAVITY.index(one.level) for one in part} for part in (seen, alone)]
-    graver = {name for name, rank in ranks[0].items() if rank < ranks[1].get(name, len(_GRAVITY))}
+    ranks = {one.name: one.rank for one in alone}
+    graver = {one.name for one in seen if one.rank < ranks.get(one.name, len(Level))}
     return [one for one in alone if one.name not in graver] + [one for one in seen if one.name in graver]

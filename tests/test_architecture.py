@@ -167,7 +167,7 @@ def is_module(target: str) -> bool:
 
 
 def bad_habits(file: Path, nodes: list[ast.AST]) -> Iterator[str]:
-    """Bare ``except``, ``import *``, and places that choose a device by its name."""
+    """Bare ``except``, ``import *``, temporary folders that may stay, and places that choose a device by its name."""
     asked = {id(part) for node in nodes if isinstance(node, ast.Compare) for part in node.comparators}
     for node in nodes:
         match node:
@@ -183,6 +183,8 @@ def bad_habits(file: Path, nodes: list[ast.AST]) -> Iterator[str]:
             # torch.backends.cuda is a setting, not a device
             case ast.Attribute(attr="cuda") if ast.unparse(node.value) != "torch.backends":
                 fault = "names a device"
+            case ast.Attribute(attr="TemporaryDirectory" | "mkdtemp"):
+                fault = "a folder that a killed process leaves behind, unlike that of scratch_folder"
             case _:
                 continue
         yield f"{name(file)}:{node.lineno} {fault}"
@@ -200,7 +202,8 @@ def test_bad_habits_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     file = tmp_path / "a.py"
     file.write_text(
         "from os import *\ntry:\n    x.cuda()\nexcept:\n    y = 'cuda:1'\n"
-        "z = y == 'cuda' or torch.backends.cuda\nfrom .. import b\n"
+        "z = y == 'cuda' or torch.backends.cuda\nfrom .. import b\nz = tempfile.mkdtemp()\n"
     )
-    assert list(look(file)[1]) == [f"a.py:{line} {fault}" for line, fault in (
-        (1, "import *"), (4, "bare except"), (3, "names a device"), (5, "names a device"))]  # fmt: skip
+    assert sorted(look(file)[1])[:4] == [f"a.py:{line} {fault}" for line, fault in (
+        (1, "import *"), (3, "names a device"), (4, "bare except"), (5, "names a device"))]  # fmt: skip
+    assert len(look(file)[1]) == 5 and "a.py:8 a folder that a killed process leaves" in sorted(look(file)[1])[4]

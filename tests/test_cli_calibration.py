@@ -10,6 +10,7 @@ import pytest
 import dvo
 from dvo.cli import main
 from dvo.commands import camera
+from dvo.data.calibration.calibration import FOUND
 from dvo.data.calibration.focal_guess import guess_from_angle
 from dvo.odometry.calibration.camera_estimate import SelfCalibration
 from tests.support.command_line import without_plots
@@ -83,6 +84,7 @@ def test_a_guess_that_is_kept_is_no_calibration_of_the_next_run(image_folder, tm
     assert main(["export", str(out), str(place), "--to", "colmap-text", "--export-images", "source"]) == 0
     model = (place / "sparse" / "0" / "cameras.txt").read_text().splitlines()[-1].split()
     assert [float(x) for x in model[4:]] == [47, 47, 32, 24]
+    assert not dvo.open(image_folder, calib=place / "sparse" / "0" / "cameras.txt").calibrated
     facts["camera"]["model"] = "pinhoel"
     (out / "run.json").write_text(json.dumps(facts))
     assert main(["export", str(out), str(tmp_path / "no"), "--to", "colmap", "--export-images", "source"]) == 2
@@ -106,6 +108,22 @@ def test_what_was_found_in_images_stays_so_in_a_file(image_folder, tmp_path, cal
     assert not dvo.open(image_folder, calib=found.calibration).calibrated
     (out / "calib.txt").write_text("51 51 31.5 23.5\n")
     assert dvo.open(image_folder, calib=out / "calib.txt").calibrated
+
+
+@pytest.mark.parametrize(("name", "file"), [("colmap-text", "sparse/0/cameras.txt"), ("nerfstudio", "transforms.json")])
+def test_what_was_found_in_images_stays_so_in_an_export(name, file, image_folder, tmp_path, calibrated):
+    out = tmp_path / "out"
+    export = ["--export", name, "--export-images", "source"]
+    assert main(["run", str(image_folder), "--out", str(out), *export]) == 0
+    later = tmp_path / "later"
+    assert main(["export", str(out), str(later), "--to", name, "--export-images", "source"]) == 0
+    for place in (out / "export" / name, later):
+        source = dvo.open(image_folder, calib=place / file)
+        assert not source.calibrated and FOUND not in source.calibration.ignored
+    given = tmp_path / "given"
+    calib = ["--calib", str(image_folder.parent / "calib.txt")]
+    assert main(["run", str(image_folder), "--out", str(given), *calib, *export]) == 0
+    assert dvo.open(image_folder, calib=given / "export" / name / file).calibrated
 
 
 def test_a_calibration_nearby_is_named_and_that_of_somebody_else_is_kept(image_folder, tmp_path, capsys, calibrated):

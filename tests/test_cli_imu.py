@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from dvo.cli import main
+from dvo.data.calibration.focal_guess import guess_from_angle
 from dvo.data.inertial import NOISE_PRESETS, InertialSamples
 from dvo.geometry.poses import invert_poses, pose_matrices
+from dvo.odometry.calibration.camera_estimate import SelfCalibration
 from tests.support.fake_odometry import FakeOdometry
 from tests.support.hand_motion import T_CAMERA_IMU, hand_motion, samples
 
@@ -87,6 +89,22 @@ def test_a_sequence_against_its_camera(sequence, imu, monkeypatch, tmp_path, cap
     write(sequence, InertialSamples(imu.timestamps, imu.gyro, -imu.accel), imu.timestamps + 0.1)
     code, out, _ = checked(capsys, str(sequence), "--imu-calib", str(calibration), "--device", "cpu")
     assert code == 1 and "give the accelerometer as (-x, -y, -z)" in out
+
+
+@pytest.mark.parametrize("is_found", [True, False])
+def test_a_camera_whose_focal_length_is_a_guess(sequence, imu, is_found, monkeypatch, tmp_path, capsys):
+    source, reason = ("self-calibration", "") if is_found else ("prior", "the motion does not tell")
+    found = SelfCalibration(30.0, 8.0, source, 32, 24, 20, reason, guess_from_angle(32, 24))
+    monkeypatch.setattr("dvo.commands.imu.calibrate", lambda *_, **__: found)
+    fake = FakeOdometry(lambda time: MOTION.poses_wc(np.array([time - 1e9]))[0])
+    monkeypatch.setattr("dvo.load", lambda *_, **__: fake)
+    file = write(sequence, imu).rename(tmp_path / "imu.csv")
+    images = (sequence / "mav0" / "cam0" / "data").rename(tmp_path / "images")
+    code, out, _ = checked(capsys, str(images), "--imu", str(file), "--imu-calib", "euroc")
+    assert code == 0 and ("warning: guessed camera: " in out) == (not is_found)
+    if not is_found:
+        assert "the motion does not tell" in out and "--calib" in out
+        assert out.index("warning: ") < out.index("note: "), "the gravest first"
 
 
 def test_samples_that_a_reader_refuses_are_opened_and_named(sequence, imu, capsys):

@@ -179,6 +179,7 @@ def export_images(
         if found is images and result.longest in members:
             points, colors = result.map.points.astype(np.float64), result.map.colors
             found = replace(images, points=points, colors=colors, errors=np.zeros(len(points)))
+        found = replace(found, was_found=not source.calibrated)
         for name, place in places.items():
             write_reconstruction(found, name, place)
             said.append(f"{name}: {_describe(found, sorted(set(range(len(roots))) - set(members)))}")
@@ -217,7 +218,7 @@ def _export_recorded(folder: Path, arguments: argparse.Namespace, choice: ImageC
     saved = stored.facts.get("map_file")
     file = Path(saved) if isinstance(saved, str) and Path(saved).is_file() else None
     if file is not None and arguments.export_images != SOURCE:
-        return _export_map_file(file, arguments.out, name, segment)
+        return _export_map_file(file, arguments.out, name, segment, bool(stored.facts.get("self_calibration")))
     if arguments.export_images not in (None, SOURCE):
         message, remedy = "the run has saved no map file", "track with --save-map, or use --export-images source"
         raise DvoError(message, file=folder, field="--export-images", remedy=remedy)
@@ -261,10 +262,10 @@ def _recorded_calibration(facts: dict[str, Any], file: Path) -> Calibration:
     except (DvoError, KeyError) as error:
         message = error.message if isinstance(error, DvoError) else "missing"
         raise DvoError(message, file=file, field="camera", remedy=REMEDY) from None
-    return Calibration(**asdict(camera), file=file)
+    return Calibration(**asdict(camera), file=file, was_found=True)
 
 
-def _export_map_file(file: Path, out: str, name: str, segment: int | None) -> None:
+def _export_map_file(file: Path, out: str, name: str, segment: int | None, was_found: bool = False) -> None:
     """Write the last recording of a map file: a segment, or the world with the most poses."""
     graph = load_graph(file)
     result, main = result_of_log(graph.log, {}, None, graph.worlds, graph.recording)
@@ -272,7 +273,7 @@ def _export_map_file(file: Path, out: str, name: str, segment: int | None) -> No
         raise DvoError(f"no segment {segment}", file=file, field="--segment", remedy=f"it has {len(result.segments)}")
     if name in MAP_FORMATS:
         chosen = graph.recording.segment + (main if segment is None else segment)
-        say(f"exported to {out}: {export_graph(graph, chosen, name, out)}")
+        say(f"exported to {out}: {export_graph(graph, chosen, name, out, was_found)}")
         return
     trajectory = result.trajectory if segment is None else result.segments[segment].trajectory
     export_trajectory(trajectory, out, name)

@@ -6,7 +6,7 @@ import argparse
 import itertools
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +66,9 @@ def check(arguments: argparse.Namespace) -> int:
     check_outputs({"--json": arguments.json}, {"the samples": given.file})  # found beside the source
     samples = given.rough()
     refusal = _refusal(given)
-    seen = () if arguments.no_vision or source is None else _seen(source, arguments)
+    seen, guessed = ((), None) if arguments.no_vision or source is None else _seen(source, arguments)
     report = check_sensor(samples, *seen)
-    if refusal is not None:
-        report = replace(report, findings=(refusal, *report.findings))
+    report = report.beside(refusal, None if report.alignment is None else guessed)
     _print(report, samples.origin)
     if arguments.json is not None:
         write_text(arguments.json, json.dumps(_facts(report, arguments.source, samples.origin), indent=2) + "\n")
@@ -118,8 +117,12 @@ def _refusal(given: InertialInput) -> Finding | None:
     return Finding("notes", Level.NOTE, "; ".join(notes), "compare with what was recorded")
 
 
-def _seen(source: Source, arguments: argparse.Namespace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times, orientations and places of the longest segment of the beginning; none if no image is tracked."""
+def _seen(
+    source: Source, arguments: argparse.Namespace
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], Finding | None]:
+    """Times, orientations and places of the longest segment of the beginning, none if no image is tracked; and a
+    finding if the focal length that they rest on is a guess."""
+    guessed = None
     device = device_of(arguments.device)
     seed_everything(arguments.seed)
     count = arguments.frames if source.frame_count is None else min(arguments.frames, source.frame_count)
@@ -128,17 +131,20 @@ def _seen(source: Source, arguments: argparse.Namespace) -> tuple[np.ndarray, np
             found = calibrate(
                 source, device=device, seed=arguments.seed, on_frame=progress.update, on_round=progress.begin_round
             )
-            source = source.recalibrated(found.calibration)
+            source = source.recalibrated(found.calibration, found.kept)
+            if found.kept is not None:
+                text = f"what is compared with the camera rests on a guess: {found}"
+                guessed = Finding("guessed camera", Level.WARNING, text, "give a calibration with --calib")
             progress.begin("tracking", count)
         odometry = dvo.load("small", device=device, seed=arguments.seed, preset="fast", loops=False)
         done = run(odometry, itertools.islice(source, arguments.frames), on_frame=progress.update)
     result = done.result
     number = result.longest
     if number is None:
-        return np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3))
+        return (np.zeros(0), np.zeros((0, 3, 3)), np.zeros((0, 3))), guessed
     trajectory = result.segments[number].trajectory
     poses = trajectory.poses_wc
-    return trajectory.timestamps, quaternion_to_matrix(poses[:, 3:]), poses[:, :3]
+    return (trajectory.timestamps, quaternion_to_matrix(poses[:, 3:]), poses[:, :3]), guessed
 
 
 def _print(report: SensorReport, origin: str) -> None:

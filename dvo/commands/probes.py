@@ -6,8 +6,9 @@ import base64
 import hashlib
 import importlib.metadata
 import platform
-import tempfile
 from pathlib import Path
+
+from dvo.data.files.output import scratch_folder
 
 
 def version_of(distribution: str) -> str | None:
@@ -58,8 +59,8 @@ def video_state(code: str, suffix: str) -> str:
 
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        with tempfile.TemporaryDirectory(prefix="dvo-doctor-") as folder:
-            file = str(Path(folder) / f"clip{suffix}")
+        with scratch_folder("dvo-doctor") as folder:
+            file = str(folder / f"clip{suffix}")
             writer = cv2.VideoWriter(file, cv2.VideoWriter.fourcc(*code), 10.0, (64, 48))
             if not writer.isOpened():
                 return "not tested (OpenCV cannot write it)"

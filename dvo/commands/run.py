@@ -373,7 +373,7 @@ def track(
         elif export:
             maps = [name for name in export if images is not None and name not in TRAJECTORY_FORMATS]
             others, place = [name for name in export if name not in maps], folder / results.EXPORT
-            said = export_run(odometry, done.result, others, place)
+            said = export_run(odometry, done.result, others, place, not getattr(clip, "calibrated", True))
             if images is not None and isinstance(clip, Source) and maps:
                 places, check = {name: place / name for name in maps}, _stopped_by(switch)
                 rows, graph = pages.rows(), graph_of(odometry)

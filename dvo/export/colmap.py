@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.data.calibration.calibration import FOUND
 from dvo.export.reconstruction import CORNER, Reconstruction
 from dvo.geometry.poses import matrix_to_quaternion
 
@@ -167,7 +168,8 @@ def _row(*values: object) -> str:
 
 
 def _cameras_txt(reconstruction: Reconstruction) -> list[str]:
-    lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    lines = [f"# {FOUND}: not measured, and maybe a guess"] if reconstruction.was_found else []
+    lines += ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     lines.append(f"# Number of cameras: {len(reconstruction.cameras)}")
     for number, (width, height, values) in enumerate(_parameters(reconstruction), start=1):
         lines.append(_row(number, "PINHOLE", width, height, *values))

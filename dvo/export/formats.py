@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -78,7 +79,9 @@ def export_map(
     return export_graph(graph, longest_segment(graph) if segment is None else segment, format, folder)
 
 
-def export_graph(graph: KeyframeGraph, segment: int, format: str, folder: Path | str) -> Reconstruction:
+def export_graph(
+    graph: KeyframeGraph, segment: int, format: str, folder: Path | str, was_found: bool = False
+) -> Reconstruction:
     """Write images, cameras and points of the archived keyframes of a segment.
 
     Args:
@@ -86,6 +89,7 @@ def export_graph(graph: KeyframeGraph, segment: int, format: str, folder: Path |
         segment: its number.
         format: name in :data:`MAP_FORMATS`.
         folder: new or empty folder.
+        was_found: the focal length was found in the images, or is a guess.
 
     Returns:
         Content of the files.
@@ -97,7 +101,7 @@ def export_graph(graph: KeyframeGraph, segment: int, format: str, folder: Path |
     from dvo.export.reconstruction import reconstruct
 
     MAP_FORMATS.target(format)
-    return write_reconstruction(reconstruct(graph, segment), format, folder)
+    return write_reconstruction(replace(reconstruct(graph, segment), was_found=was_found), format, folder)
 
 
 def write_reconstruction(reconstruction: Reconstruction, format: str, folder: Path | str) -> Reconstruction:
@@ -143,7 +147,9 @@ def export_trajectory(trajectory: Trajectory, folder: Path | str, format: str = 
         write(trajectory, part)
 
 
-def export_run(odometry: Odometry, result: Result, formats: Iterable[str], folder: Path) -> list[str]:
+def export_run(
+    odometry: Odometry, result: Result, formats: Iterable[str], folder: Path, was_found: bool = False
+) -> list[str]:
     """Write the exports of a run into a new folder ``folder/NAME`` each.
 
     Map formats hold the longest segment and those that share its world. Trajectory formats hold the longest segment,
@@ -154,6 +160,7 @@ def export_run(odometry: Odometry, result: Result, formats: Iterable[str], folde
         result: its result, in frames of the source, with at least one pose.
         formats: names in :data:`MAP_FORMATS` and :data:`TRAJECTORY_FORMATS`.
         folder: of the exports.
+        was_found: the focal length was found in the images, or is a guess.
 
     Returns:
         A sentence for each format.
@@ -161,11 +168,14 @@ def export_run(odometry: Odometry, result: Result, formats: Iterable[str], folde
     Raises:
         DvoError: as :func:`export_map`.
     """
+    from dvo.export.reconstruction import longest_segment
+
     said = []
     for name in formats:
         if name in MAP_FORMATS:
-            chosen = None if result.longest is None else result.longest + graph_of(odometry).recording.segment
-            said.append(f"{name}: {export_map(odometry, folder / name, name, chosen)}")
+            graph = graph_of(odometry)
+            chosen = longest_segment(graph) if result.longest is None else result.longest + graph.recording.segment
+            said.append(f"{name}: {export_graph(graph, chosen, name, folder / name, was_found)}")
             continue
         export_trajectory(result.trajectory, folder / name, name)
         if len(result.segments) > 1:

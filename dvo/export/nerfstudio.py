@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from dvo.data.calibration.calibration import FOUND
 from dvo.export.colmap import mask_file, write_images
 from dvo.export.reconstruction import CORNER, Reconstruction
 from dvo.geometry.camera import Camera
@@ -50,6 +51,7 @@ def write_nerfstudio(reconstruction: Reconstruction, folder: Path) -> None:
         frames.append({"file_path": f"images/{name}", "timestamp": time, **own, "transform_matrix": matrix})
     values = {
         "camera_model": "OPENCV",
+        **({FOUND: True} if r.was_found else {}),
         **(_intrinsics(r.cameras[0]) if single else {}),
         "applied_transform": APPLIED_TRANSFORM.tolist(),
         "ply_file_path": POINTS,

@@ -75,6 +75,7 @@ class Reconstruction:
         residuals: ``(O,)`` reprojection errors, pixels; 0 in the image that the patch of the point was taken from.
         without_image: number of keyframes left out because their image is not kept.
         masks: content of N PNG files, white where the image is used and black where it is not; empty without masks.
+        was_found: the focal length was found in the images, or is a guess: formats with a place for it say so.
     """
 
     cameras: tuple[Camera, ...]
@@ -92,6 +93,7 @@ class Reconstruction:
     residuals: np.ndarray
     without_image: int = 0
     masks: Sequence[bytes] = ()
+    was_found: bool = False
 
     @property
     def names(self) -> list[str]:

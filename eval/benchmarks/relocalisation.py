@@ -18,7 +18,6 @@ a world, and the ATE of the poses that were told while tracking and of the resul
 from __future__ import annotations
 
 import argparse
-import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -30,6 +29,7 @@ import torch
 
 import dvo
 from dvo.core.command_line import OneLineParser
+from dvo.data.files.output import scratch_folder
 from dvo.data.frame import Frame
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory
@@ -223,10 +223,10 @@ def main(arguments: list[str] | None = None) -> None:
     within = {"goes on": 0, "comes back": 0}
     elsewhere = wrong = 0
     print("| sequence | seed | frames, goes on | error % | frames, comes back | error % |\n|---|--:|--:|--:|--:|--:|")
-    with tempfile.TemporaryDirectory() as folder:
+    with scratch_folder("dvo-relocalisation") as folder:
         for one in recorded:
             for seed in range(options.seeds):
-                file = Path(folder) / f"{one.name}_{seed}.dvo"
+                file = folder / f"{one.name}_{seed}.dvo"
                 known, cells = saved(one, seed, file), []
                 for kind, start in (("goes on", 1 / 3), ("comes back", AGAIN)):
                     count, estimate = found_after(file, one.frames(start, TRIED), seed)
@@ -237,7 +237,7 @@ def main(arguments: list[str] | None = None) -> None:
             for other in recorded:
                 if other is not one:
                     elsewhere += 1
-                    wrong += found_after(Path(folder) / f"{one.name}_0.dvo", other.frames(0.2, TRIED), 0)[0] is not None
+                    wrong += found_after(folder / f"{one.name}_0.dvo", other.frames(0.2, TRIED), 0)[0] is not None
     runs = len(recorded) * options.seeds
     print(f"\nFound within {FEW} frames: " + ", ".join(f"{kind} {count} of {runs}" for kind, count in within.items()))
     print(f"Found in maps of other places: {wrong} of {elsewhere}")

@@ -11,8 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -20,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import scratch_folder
 from dvo.data.readers.tum import RIGHT
 from dvo.data.trajectory import write_tum
 from eval.suites.inertial import write_exact
 
 RECORD = "sequence.json"
-STALE = 24 * 3600.0  # seconds after which an unfinished folder belongs to no running process
 
 
 def cache_folder() -> Path:
@@ -69,19 +67,16 @@ def rendered_folder(name: str, options: dict[str, Any]) -> Path:
     folder = place_of(name, options)
     if (folder / RECORD).is_file():
         return folder
-    _sweep(folder.parent)
-    part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        _write(part, name, options)
-        try:
-            part.rename(folder)
-        except OSError:
-            if not (folder / RECORD).is_file():  # else another process was faster, with the same bytes
-                raise
+        with scratch_folder(folder.name, folder.parent) as part:
+            _write(part, name, options)
+            try:
+                part.rename(folder)
+            except OSError:
+                if not (folder / RECORD).is_file():  # else another process was faster, with the same bytes
+                    raise
     except OSError as error:
         raise DvoError(str(error), file=folder, field="DVO_CACHE", remedy="make room or set another folder") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return folder
 
 
@@ -126,13 +121,3 @@ def _write(folder: Path, name: str, options: dict[str, Any]) -> None:
         "processor_seconds": round(time.process_time() - clock, 2),
     }  # fmt: skip
     (folder / RECORD).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-
-
-def _sweep(folder: Path) -> None:
-    """Remove what interrupted renderings left long ago."""
-    for part in folder.glob(".*"):
-        try:
-            if time.time() - part.stat().st_mtime > STALE:
-                shutil.rmtree(part, ignore_errors=True)
-        except OSError:  # gone meanwhile
-            continue

@@ -32,7 +32,10 @@ _SIZES = [
 ]  # fmt: skip
 
 
-FOUND_BY_DVO = "# focal length found by dvo; a run without a calibration replaces this file\n"
+FOUND = "focal length found by dvo"
+"""Beginning of the comment in the first line of a file, and key in JSON: of a focal length that was found in the images
+of a clip, or is a guess."""
+FOUND_BY_DVO = f"# {FOUND}; a run without a calibration replaces this file\n"
 """First line of a calibration file of a focal length that was found in the images of a clip."""
 
 
@@ -48,7 +51,7 @@ class Calibration:
         depth_scale: units of a metre in depth images of integers that belong to the images.
         baseline: metres from the camera to the right camera of a rectified pair with the same intrinsics.
         readout: seconds in which a rolling shutter reads the rows, as in :class:`dvo.geometry.camera.Camera`.
-        was_found: dvo has found it in the images of a clip, as the file may say (:data:`FOUND_BY_DVO`).
+        was_found: dvo has found it in the images of a clip, or guessed it, as the file may say (:data:`FOUND`).
         dialect: form of the file that it was read from.
         ignored: keys of the file that were not used.
         notes: what the user has to know about the file, in sentences; :meth:`doubts` has them too.

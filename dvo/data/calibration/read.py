@@ -10,7 +10,7 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.core.registry import Registry
 from dvo.core.yaml_files import MAX_BYTES, is_shell_pipe, read_text
-from dvo.data.calibration.calibration import EXPECTED, FOUND_BY_DVO, Calibration, Dialect
+from dvo.data.calibration.calibration import EXPECTED, FOUND, Calibration, Dialect
 from dvo.data.calibration.colmap_cameras import split_camera
 from dvo.data.calibration.numpy_files import SUFFIXES
 from dvo.data.files.files import MAX_NUMBER, is_file
@@ -99,7 +99,7 @@ def read_calibration(path: Path | str) -> Calibration:
     if camera is not None and name in _BUILT_IN and name not in _NUMBERED:
         raise DvoError("no numbered cameras in it", file=path, field="calibration", remedy=f"leave out :{camera}")
     calibration = dialects[name].read(path, text, camera)
-    was_found = text.startswith(FOUND_BY_DVO)
+    was_found = calibration.was_found or text.startswith(f"# {FOUND}")
     calibration = replace(calibration, dialect=calibration.dialect or name, was_found=was_found)
     values = [calibration.fx, calibration.fy, calibration.cx, calibration.cy, *calibration.coefficients]
     if not (np.abs(values) <= MAX_NUMBER).all():  # NaN fails too

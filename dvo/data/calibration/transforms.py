@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import Calibration, Dialect
+from dvo.data.calibration.calibration import FOUND, Calibration, Dialect
 from dvo.data.calibration.colmap_cameras import CORNER
 from dvo.data.calibration.documents import load_json
 from dvo.data.calibration.values import from_values
@@ -68,7 +68,7 @@ def transforms_calibration(path: Path, text: str) -> Calibration:
     data = load_json(text, path)
     frames = data.get("frames")
     frames = [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
-    top = {key: value for key, value in data.items() if key != "frames"}
+    top = {key: value for key, value in data.items() if key not in ("frames", FOUND)}
     own = [{key: frame[key] for key in (*_KEYS, *_ANGLES) if key in frame} for frame in frames]
     if any(camera != own[0] for camera in own[1:]):
         raise DvoError(
@@ -92,7 +92,9 @@ def transforms_calibration(path: Path, text: str) -> Calibration:
         raise DvoError(message, file=path, field="k4", remedy="calibrate with OPENCV or OPENCV_FISHEYE")
     found = from_values(values, path)
     ignored = (*found.ignored, *(["frames"] if frames else []))
-    return replace(found, cx=found.cx - CORNER, cy=found.cy - CORNER, ignored=ignored)
+    return replace(
+        found, cx=found.cx - CORNER, cy=found.cy - CORNER, ignored=ignored, was_found=data.get(FOUND) is True
+    )
 
 
 def _focal(angle: Any, side: Any, name: str, path: Path) -> float:

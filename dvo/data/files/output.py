@@ -95,8 +95,8 @@ def spelled_in_text(path: Path) -> Iterator[str]:
     if in_utf8(text) == text:
         yield text
         return
-    with tempfile.TemporaryDirectory(prefix="dvo-") as folder:
-        link = Path(folder) / f"file{path.suffix if path.suffix.isascii() else ''}"
+    with scratch_folder("dvo-link") as folder:
+        link = folder / f"file{path.suffix if path.suffix.isascii() else ''}"
         try:
             link.symlink_to(path.absolute())
         except OSError:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -32,6 +32,11 @@ class Finding:
     level: Level
     text: str
     remedy: str
+
+    @property
+    def rank(self) -> int:
+        """0 for the gravest level."""
+        return list(Level).index(self.level)
 
     def __str__(self) -> str:
         return f"{self.level}: {self.name}: {self.text}; {self.remedy}"
@@ -63,6 +68,17 @@ class SensorReport:
     values: dict[str, Any]
     findings: tuple[Finding, ...]
     alignment: ImuAlignment | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "findings", tuple(sorted(self.findings, key=lambda finding: finding.rank)))
+
+    def beside(self, *findings: Finding | None) -> SensorReport:
+        """The same with further findings.
+
+        Args:
+            findings: None for those that there are not.
+        """
+        return replace(self, findings=(*(one for one in findings if one is not None), *self.findings))
 
     @property
     def is_usable(self) -> bool:

@@ -23,6 +23,8 @@ MISSING = (0.01, 0.3)
 """Share of missing samples that is told, and that makes them unusable."""
 GRAVITY_ERROR = (0.4, 2.0)
 """Deviation of the force at rest from gravity that is told, and that makes samples unusable, m/s^2."""
+SPEED_CHANGE = 2.0
+"""Usual change of the speed within a stretch that seems to be rest, as in a lift, m/s."""
 GYRO_BIAS = (0.1, 0.35)
 """Bias of the gyroscope that is told, and that makes samples unusable, rad/s."""
 FASTEST = 70.0
@@ -334,9 +336,11 @@ def _at_rest(samples: InertialSamples) -> Found:
     findings = []
     if seconds >= 1:
         gyro = np.median(np.concatenate([samples.gyro[part] for part in parts]), 0)
-        force = float(np.median([np.linalg.norm(samples.accel[part].mean(0)) for part in parts]))
+        force, sure = _gravity(samples, parts)
         values |= {"gyroscope at rest, rad/s": gyro.tolist(), "gravity at rest, m/s^2": force}
-        findings += [finding for finding in (gyro_bias(gyro, "at rest"), gravity_error(force, "at rest")) if finding]
+        is_told = abs(force - STANDARD_GRAVITY) > sure
+        findings += [finding for finding in (gyro_bias(gyro, "at rest"),) if finding]
+        findings += [finding for finding in (gravity_error(force, "at rest"),) if finding and is_told]
     if seconds < _MIN_REST:
         text = f"at rest for {seconds:.2g} s only: noise and bias are not measured"
         remedy = "lay the device down for five seconds at the start"
@@ -354,6 +358,18 @@ def _at_rest(samples: InertialSamples) -> Found:
             text = f"at rest the noise is {max(ratios):.2g} times the stated one"
             findings.append(Finding("noise", Level.NOTE, text, "state smaller densities, if motion is slow"))
     return Found(values, tuple(findings))
+
+
+def _gravity(samples: InertialSamples, parts: list[slice]) -> tuple[float, float]:
+    """Size of the force at rest, by means over a second, as a sensor may turn slowly; and how much an acceleration
+    that is as steady as rest can change it: over the longest stretch it is a change of speed."""
+    second = 10 * max(1, round(_BLOCK * samples.rate))  # no stretch is shorter
+    sizes, longest = [], 0.0
+    for part in parts:
+        means = [samples.accel[k : k + second].mean(0) for k in range(part.start, part.stop - second + 1, second)]
+        sizes += [float(np.linalg.norm(mean)) for mean in means]
+        longest = max(longest, (part.stop - part.start) / samples.rate)
+    return float(np.median(sizes)), SPEED_CHANGE / longest
 
 
 def gyro_bias(bias: Array, where: str) -> Finding | None:

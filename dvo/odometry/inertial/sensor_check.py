@@ -13,7 +13,6 @@ from dvo.odometry.inertial.findings import Finding, Level, SensorReport
 from dvo.odometry.inertial.sample_checks import check_axes, check_stamps, check_values
 from dvo.odometry.inertial.vision_checks import check_against_vision
 
-_GRAVITY = tuple(Level)  # the gravest first
 _MIN_FRAMES = 20
 
 
@@ -30,7 +29,8 @@ def check_sensor(
             wrong.
         timestamps: ``(N,)`` increasing times of frames with a pose in one world, seconds; None without vision.
         rotations_wc: ``(N, 3, 3)`` their orientations, camera to world.
-        positions_wc: ``(N, 3)`` their places in any unit; None: the sign of the accelerometer is not checked.
+        positions_wc: ``(N, 3)`` their places in any unit; None: the sign of the accelerometer is not checked, and its
+            bias against what usual motion leaves.
 
     Returns:
         Numbers and findings.
@@ -46,8 +46,7 @@ def check_sensor(
     if timestamps is not None and rotations_wc is not None and len(timestamps) >= _MIN_FRAMES:
         alignment, found = check_against_vision(samples, timestamps, rotations_wc, positions_wc)
         values |= found.values
-        known = {finding.name for finding in findings}
-        findings += [finding for finding in found.findings if finding.name not in known]
+        findings = _joined(findings, found.findings)
     else:
         text = "time offset and axes are not checked without orientations of the camera"
         if timestamps is not None:
@@ -64,5 +63,11 @@ def check_sensor(
         text = "the noise of the sensor is not stated, that of a phone is assumed"
         remedy = "state noise, or a preset (euroc, action, phone), in --imu-calib"
         findings.append(Finding("no noise", Level.NOTE, text, remedy))
-    findings.sort(key=lambda finding: _GRAVITY.index(finding.level))
     return SensorReport(values, tuple(findings), alignment)
+
+
+def _joined(alone: list[Finding], seen: tuple[Finding, ...]) -> list[Finding]:
+    """Findings of the samples alone and of vision; of the same name those of vision only if they are graver."""
+    ranks = {one.name: one.rank for one in alone}
+    graver = {one.name for one in seen if one.rank < ranks.get(one.name, len(Level))}
+    return [one for one in alone if one.name not in graver] + [one for one in seen if one.name in graver]

@@ -9,9 +9,10 @@ import numpy as np
 from dvo.data.inertial import NOISE_PRESETS, InertialSamples
 from dvo.geometry.poses import matrix_to_quaternion, quaternion_to_matrix, rotation_vector
 from dvo.odometry.inertial.findings import Finding, Found, Level
+from dvo.odometry.inertial.mean_forces import MeanForces, bias_and_gravity
 from dvo.odometry.inertial.sample_checks import SIGNED_AXES, gravity_error, gyro_bias, in_radians, named_axes
 from dvo.odometry.inertial.smoother import OPPOSED, Smoother, VisualNodes, acceleration_sign
-from dvo.odometry.inertial.temporal import ImuAlignment, align_imu, integrate_gyro
+from dvo.odometry.inertial.temporal import ImuAlignment, align_imu
 
 Array = np.ndarray
 OFFSET = (0.005, 0.05)
@@ -24,8 +25,7 @@ ACCEL_BIAS = (0.5, 2.0)
 """Bias of the accelerometer that is told, and that makes samples unusable, m/s^2."""
 _WIDE = 3.0  # seconds on either side of a second search, where the first one finds no offset
 _WINDOW = 4.0  # seconds of vision for one point of the line of offsets
-_MIN_WINDOWS = 3
-_MEAN = 0.5  # seconds over which the force is averaged
+_MIN_WINDOWS, _MIN_MEANS = 3, 8
 _AXES = ("axes", "accelerometer axes")
 _TELLS = 0.5  # share of the variance that other axes of the accelerometer must leave
 
@@ -112,7 +112,8 @@ def check_against_vision(
         samples: with increasing times, in rad/s and m/s^2; a gyroscope in deg/s is told.
         timestamps: ``(N,)`` increasing times of frames.
         rotations_wc: ``(N, 3, 3)`` camera to world.
-        positions_wc: ``(N, 3)`` of the camera in any unit; None: the sign of the accelerometer is not checked.
+        positions_wc: ``(N, 3)`` of the camera in any unit; None: the sign of the accelerometer is not checked, and
+            its bias against what usual motion leaves.
 
     Returns:
         The alignment, and what was found.
@@ -146,7 +147,7 @@ def check_against_vision(
     clock = _clock(found, line)
     parts = [clock, _axes(found, stated)]
     if found.is_offset_told:
-        parts.append(_biases(samples, found, timestamps, rotations_wc))
+        parts.append(_biases(samples, found, timestamps, rotations_wc, positions_wc))
     is_told = found.is_offset_told and (stated is not None or found.is_rotation_told)
     if positions_wc is not None and is_told and not any(one.name in _AXES for part in parts for one in part.findings):
         parts.append(_sign(samples, found, timestamps, rotations_wc, positions_wc))
@@ -242,29 +243,28 @@ def _axes(found: ImuAlignment, stated: Array | None) -> Found:
     return Found(values, (Finding("axes", level, text, remedy),))
 
 
-def _biases(samples: InertialSamples, found: ImuAlignment, timestamps: Array, rotations_wc: Array) -> Found:
+def _biases(
+    samples: InertialSamples, found: ImuAlignment, timestamps: Array, rotations_wc: Array, positions_wc: Array | None
+) -> Found:
     """Bias of the gyroscope; bias and axes of the accelerometer against gravity in the world of the camera."""
     values: dict[str, object] = {}
     findings = []
     if np.isfinite(found.sigma_bias).all():
         values["gyroscope bias, rad/s"] = found.gyro_bias.tolist()
         findings += [finding for finding in (gyro_bias(found.gyro_bias, "against vision"),) if finding]
-    turns, forces = _world(samples, found, timestamps, rotations_wc)
-    if len(turns) < 8:
+    means = MeanForces.of(samples, found, timestamps, rotations_wc)
+    if len(means.forces) < _MIN_MEANS:
         return Found(values, tuple(findings))
-    spread = [float(np.einsum("nij,nj->ni", turns @ option, forces).var(0).sum()) for option in SIGNED_AXES]
+    spread = [float(means.in_world(option).var(0).sum()) for option in SIGNED_AXES]
     best, same = int(np.argmin(spread)), spread[_identity()]
     if spread[best] < _TELLS * same and same > 0.5:
         remedy = f"give the accelerometer as {named_axes(SIGNED_AXES[best])}"
         text = "the accelerometer does not see gravity where the gyroscope turns it: their axes differ"
         findings.append(Finding("accelerometer axes", Level.UNUSABLE, text, remedy))
         return Found(values, tuple(findings))
-    rows = np.concatenate([turns, np.broadcast_to(np.eye(3), turns.shape)], -1).reshape(-1, 6)
-    seen = np.einsum("nij,nj->ni", turns, forces).reshape(-1)
-    inverse = np.linalg.pinv(rows.T @ rows)
-    solution = inverse @ rows.T @ seen
-    scatter = float(((seen - rows @ solution) ** 2).sum()) / max(len(seen) - 6, 1)
-    sigma = np.sqrt(scatter * np.diagonal(inverse))
+    arm = np.zeros(3) if samples.T_camera_imu is None else samples.T_camera_imu[:3]
+    walk = (samples.noise or NOISE_PRESETS["phone"]).accel_walk
+    solution, sigma = bias_and_gravity(means, walk, positions_wc, arm)
     bias, gravity = solution[:3], float(np.linalg.norm(solution[3:]))
     if sigma[:3].max() < ACCEL_BIAS[0] / 2:
         values |= {"accelerometer bias, m/s^2": bias.tolist(), "deviation of the bias, m/s^2": sigma[:3].tolist(),
@@ -301,25 +301,3 @@ def _sign(
 
 def _identity() -> int:
     return next(k for k, option in enumerate(SIGNED_AXES) if np.array_equal(option, np.eye(3)))
-
-
-def _world(
-    samples: InertialSamples, found: ImuAlignment, timestamps: Array, rotations_wc: Array
-) -> tuple[Array, Array]:
-    """Orientations ``(W, 3, 3)`` sensor to world and mean forces ``(W, 3)`` of windows short enough to turn little.
-
-    The gyroscope carries the orientation of the frame in the middle to the samples of its window.
-    """
-    times = samples.timestamps - found.time_offset
-    path = integrate_gyro(times, samples.gyro, found.gyro_bias)
-    turns, forces, last = [], [], -np.inf
-    for k in range(len(timestamps)):
-        time = float(timestamps[k])
-        first, end = np.searchsorted(times, [time - _MEAN / 2, time + _MEAN / 2])
-        if time < last + _MEAN or end - first < 5 or first == 0 or end == len(times):
-            continue
-        own = np.swapaxes(path.at(np.array([time]))[0], -1, -2)[0] @ path.rotations[first:end]
-        turns.append(rotations_wc[k] @ found.rotation_camera_imu)
-        forces.append(np.einsum("nij,nj->i", own, samples.accel[first:end]) / (end - first))
-        last = time
-    return np.array(turns).reshape(-1, 3, 3), np.array(forces).reshape(-1, 3)

@@ -6,12 +6,12 @@ placed are interpolated (which costs a hand-held camera its shake). Frames that 
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
+from contextlib import ExitStack
 
 import cv2
 import numpy as np
 
+from dvo.data.files.output import scratch_folder
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory, interpolate
 from dvo.geometry.poses import poses_from_matrices
@@ -34,8 +34,9 @@ class Colmap:
 
     def __init__(self, seed: int = 0, most_images: int = MOST_IMAGES) -> None:
         self._seed, self._most = seed, most_images
-        self._folder = tempfile.TemporaryDirectory(prefix="colmap-")
-        self._images = Path(self._folder.name) / "images"
+        self._scratch = ExitStack()
+        self._folder = self._scratch.enter_context(scratch_folder("dvo-colmap"))
+        self._images = self._folder / "images"
         self._images.mkdir()
         self._pictures = Pictures(smallest=0)
         self._times: list[float] = []
@@ -61,7 +62,7 @@ class Colmap:
         steps = np.diff(self._times)
         gap = 1.5 * stride * float(np.median(steps)) if len(steps) else 0.0
         trajectory = interpolate(placed, np.array(self._times), max_gap=gap)
-        self._folder.cleanup()
+        self._scratch.close()
         info = {**self._pictures.facts(), "stride": stride, "placed": len(placed), "models": models}
         return Result(trajectory, sparse_map, len(self._times), len(self._times) - len(trajectory), info)
 
@@ -76,7 +77,7 @@ class Colmap:
         camera = self._pictures.camera
         assert camera is not None
         pycolmap.set_random_seed(self._seed)
-        folder = Path(self._folder.name)
+        folder = self._folder
         database = folder / "database.db"
         fx, fy, cx, cy = camera.intrinsics
         # COLMAP counts from the corner of the first pixel, not from its centre.

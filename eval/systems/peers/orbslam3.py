@@ -24,9 +24,9 @@ else the small one beside the test data is taken: figures with either are not th
 from __future__ import annotations
 
 import os
-import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -35,6 +35,7 @@ import cv2
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import scratch_folder
 from dvo.data.files.root import data_root
 from dvo.data.frame import Frame, StereoView
 from dvo.data.inertial import NOISE_PRESETS, InertialSamples
@@ -119,7 +120,8 @@ class OrbSlam3:
         self._is_inertial, self._is_stereo = sensor.startswith(IMU), sensor.endswith("stereo")
         self._package, self._loops, self._pace = pyorbslam3, loops, pace
         self._vocabulary = vocabulary_file()
-        self._folder = tempfile.TemporaryDirectory(prefix="orbslam3-")
+        self._scratch = ExitStack()
+        self._folder = self._scratch.enter_context(scratch_folder("dvo-orbslam3"))
         self._pictures, self._pictures_right = Pictures(), Pictures()
         self._slam: Any = None
         self._rows: list[Row] = []
@@ -134,7 +136,7 @@ class OrbSlam3:
         image = self._pictures(frame)
         if self._slam is None:
             assert self._pictures.camera is not None
-            file = Path(self._folder.name) / "settings.yaml"
+            file = self._folder / "settings.yaml"
             baseline = KINECT_BASELINE if self._sensor == "rgbd" else None
             if self._is_stereo:
                 baseline = rectified_view(frame).baseline
@@ -188,7 +190,7 @@ class OrbSlam3:
             self._slam.shutdown()
             self._read_keyframes()
         rows, keyframes, worlds = place_maps(self._rows, list(self._keyframes.values()))
-        self._folder.cleanup()
+        self._scratch.close()
         info = {
             **self._pictures.facts(),
             "vocabulary": self._vocabulary.name,
@@ -219,7 +221,7 @@ class OrbSlam3:
 
     def _read_keyframes(self) -> None:
         """Keep where the keyframes of the present map are."""
-        file = Path(self._folder.name) / "keyframes.txt"
+        file = self._folder / "keyframes.txt"
         file.unlink(missing_ok=True)
         self._slam.save_keyframe_trajectory_tum(str(file))
         if file.is_file() and file.read_text().strip():

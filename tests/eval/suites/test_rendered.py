@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import time
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +11,12 @@ import numpy as np
 import pytest
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import scratch_folder
 from dvo.synth import HELD_OUT, LONG_KINDS, make_sequence
 from dvo.synth.export import write_calibration
 from dvo.synth.surroundings import SURROUNDINGS
 from eval import commands
 from eval.__main__ import main
-from eval.suites import rendered
 from eval.suites.rendered import RECORD, place_of, rendered_folder
 from eval.suites.suite import Sequence, open_sequence, read_suites
 
@@ -192,15 +190,12 @@ def test_interrupted_rendering_leaves_nothing_that_counts(cache: Path, monkeypat
         rendered_folder("one", OPTIONS)
     assert list(cache.iterdir()) == []
     monkeypatch.setattr(cv2, "imwrite", write)
-    # A killed process cannot clean up: its folder does no harm and goes after a day.
-    left = cache / f".{place_of('one', OPTIONS).name}.killed"
+    # A killed process cannot clean up: its folder does no harm and goes with the next one.
+    with scratch_folder(place_of("one", OPTIONS).name, cache) as part:
+        left = part.with_name(part.name.replace(f"-{os.getpid()}-", f"-{2**31 - 1}-"))  # a number that no process has
     (left / "rgb").mkdir(parents=True)
     folder = rendered_folder("one", OPTIONS)
-    assert len(list((folder / "rgb").iterdir())) == 4 and left.exists()
-    os.utime(left, (time.time() - 2 * rendered.STALE,) * 2)
-    shutil.rmtree(folder)
-    rendered_folder("one", OPTIONS)
-    assert not left.exists()
+    assert len(list((folder / "rgb").iterdir())) == 4 and [one.name for one in cache.iterdir()] == [folder.name]
 
 
 def test_two_at_once_agree(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

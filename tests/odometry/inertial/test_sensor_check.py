@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dvo.data.inertial import NOISE_PRESETS, InertialSamples
-from dvo.geometry.poses import invert_poses, rotation_vector, so3_exp
+from dvo.geometry.poses import invert_poses, rotation_vector, so3_exp, split
 from dvo.odometry.inertial.findings import Level, SensorReport
 from dvo.odometry.inertial.sensor_check import check_sensor
 from dvo.odometry.inertial.vision_checks import clock_line
@@ -159,6 +159,77 @@ def test_bias_of_a_dropped_sensor() -> None:
     report = checked(gyro=imu.gyro + np.array([0.3, -0.3, 0.1]), accel=imu.accel + np.array([0.0, 1.5, -1.5]))
     assert names(report) == {"gyroscope bias", "accelerometer bias"} and not report.is_usable
     assert np.allclose(report.values["accelerometer bias, m/s^2"], [0, 1.5, -1.5], atol=0.5)
+
+
+def moving(
+    seed: int, twist: tuple[float, ...], grade: str = "euroc"
+) -> tuple[InertialSamples, np.ndarray, np.ndarray, np.ndarray]:
+    """Samples, and what a camera that shakes about a constant twist sees in a unit of its own."""
+    path = replace(hand_motion(seed, (0.15, 0.15, 0.15)), twist=np.array(twist))
+    imu = samples(path, 20.0, rate=100.0, noise=replace(NOISE_PRESETS[grade], accel_bias=0.05), seed=seed)
+    times, rotations = frames(path, 20.0, rate=20.0, seed=seed)
+    return imu, times, rotations, 2.5 * split(path.poses_wc(times))[1]
+
+
+@pytest.mark.parametrize(
+    ("twist", "grade"),
+    [((0, 0, 1.2, 0, 0.8, 0), "euroc"), ((0, 0, 1.2, 0, 0.8, 0), "phone"), ((-0.9, 0, 0, 0, 0.9, 0), "phone")],
+    ids=["circle", "circle, phone", "arm"],
+)
+def test_motion_is_no_bias_of_the_accelerometer(twist: tuple[float, ...], grade: str) -> None:
+    """A camera on a circle feels a force that turns with it, as a bias does."""
+    imu, *seen = moving(25, twist, grade)
+    for views in (seen, seen[:2]):
+        assert check_sensor(imu, *views).named("accelerometer bias") is None
+    bias = np.array([0.3, -0.4, 0.35])
+    for factor, level in ((1, Level.WARNING), (4, Level.UNUSABLE)):
+        report = check_sensor(replace(imu, accel=imu.accel + factor * bias), *seen)
+        finding = report.named("accelerometer bias")
+        assert finding is not None and finding.level == level
+        assert np.allclose(report.values["accelerometer bias, m/s^2"], factor * bias, atol=0.3)
+
+
+@pytest.mark.parametrize("grade", ["euroc", "phone"])
+@pytest.mark.parametrize(("seconds", "options"), [(12.0, {}), (24.0, {"drift": 0.02, "walk": 2e-3})])
+def test_small_bias_in_the_motion_of_a_hand(grade: str, seconds: float, options: dict[str, float]) -> None:
+    seen = record(3, seconds=seconds, grade=grade, **options)  # type: ignore[arg-type]
+    views = seen.times, seen.rotation, seen.position
+    right = check_sensor(seen.samples, *views)
+    assert right.named("accelerometer bias") is None
+    own = np.array(right.values["accelerometer bias, m/s^2"])
+    for bias in np.array([[0.0, 0.6, 0.0], [-1.5, 0.0, 2.0]]) - own:
+        report = check_sensor(replace(seen.samples, accel=seen.samples.accel + bias), *views)
+        finding = report.named("accelerometer bias")
+        assert finding is not None and report.is_usable == (np.linalg.norm(bias + own) < 2)
+
+
+def test_graver_finding_of_one_name_is_told() -> None:
+    """At rest gravity tells a part of a bias, motion the whole of it."""
+    seen = record(1, still=6.0, turning=False, seconds=20.0)
+    bias = np.linalg.norm(seen.samples.accel[:600].mean(0)) * np.array([0.25, 0.1, 0.0])
+    report = check_sensor(
+        replace(seen.samples, accel=seen.samples.accel + bias), seen.times, seen.rotation, seen.position
+    )  # fmt: skip
+    finding = report.named("accelerometer bias")
+    assert finding is not None and "against vision" in finding.text and not report.is_usable
+
+
+def test_a_lift_that_sets_out_is_no_bias() -> None:
+    """For a second and a half its acceleration is as steady as rest."""
+    rng, times = np.random.default_rng(0), np.arange(1200) / 100
+    sets_out = (times > 4) & (times < 5.5)
+    shaken = np.where(sets_out, 0.0, 0.2 * np.sin(30 * times))
+    accel = rng.normal(0, 0.02, (1200, 3)) + np.array([0, 0, 9.81]) + np.outer(sets_out, [0, 0, 1.0])
+    report = check_sensor(InertialSamples(times, rng.normal(0, 1e-3, (1200, 3)) + shaken[:, None], accel))
+    assert report.values["gravity at rest, m/s^2"] == pytest.approx(10.81, abs=0.02)
+    assert report.named("accelerometer bias") is None
+
+
+def test_a_slow_turn_is_no_bias() -> None:
+    angle = 0.03 * np.arange(6000) / 100
+    accel = 9.81 * np.stack([np.sin(angle), 0 * angle, np.cos(angle)], 1)
+    report = check_sensor(InertialSamples(np.arange(6000) / 100, np.tile([0.0, -0.03, 0.0], (6000, 1)), accel))
+    assert report.values["at rest, s"] > 50 and report.named("accelerometer bias") is None
 
 
 def test_bias_noise_and_gravity_at_rest() -> None:

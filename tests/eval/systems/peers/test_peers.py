@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import PART
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
@@ -285,11 +286,13 @@ def test_colmap_takes_a_part_of_a_long_sequence_and_its_end(monkeypatch):
     assert package.extract_features.call_args.kwargs["image_names"] == [f"{k:06d}.png" for k in (0, 3, 6, 9, 11)]
 
 
-def test_colmap_of_none_and_one_frame():
+def test_colmap_of_none_and_one_frame(monkeypatch, tmp_path):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     frame = Frame(0, 0.0, np.zeros((48, 64, 3), np.uint8), Camera(60.0, 60.0, 31.5, 23.5, 64, 48))
     nothing, one = colmap.Colmap(), colmap.Colmap()
     one.track(frame)
-    assert nothing.finish().frames_read == 0 and one.finish().frames_lost == 1
+    assert all(folder.name.startswith(PART) for folder in tmp_path.iterdir()), "the next one removes them if need be"
+    assert nothing.finish().frames_read == 0 and one.finish().frames_lost == 1 and not list(tmp_path.iterdir())
 
 
 # The conventions (which way poses go, where pixel centres lie) show in rotation as well as in position.

@@ -25,6 +25,7 @@ from dvo.odometry.frames.gate import Gate
 from dvo.odometry.loops.closure import LoopCloser
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.finishing import run_information
+from dvo.odometry.patch.inertial import InertialTracking
 from dvo.odometry.patch.initialisation import NOT_INITIALISED
 from dvo.odometry.patch.map_tables import LoopsTable, LoopTable, MapTable, WeightsTable
 from dvo.odometry.patch.state import TrackerState
@@ -45,6 +46,7 @@ class SavedTracker(Protocol):
     state: TrackerState
     patch_window: PatchWindow
     loops: LoopCloser
+    inertial: InertialTracking
 
 
 def save_map(file: str | Path, odometry: SavedTracker) -> None:

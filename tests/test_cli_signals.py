@@ -281,9 +281,12 @@ def test_a_signal_while_exports_are_written_lets_them_end(given, image_folder, t
 )
 @pytest.mark.parametrize("error", [DvoError("not a safetensors file"), ValueError("shape"), OSError("cannot read")])
 def test_a_signal_that_a_library_turns_into_another_error(
-    number, code, said, error, image_folder, tmp_path, monkeypatch, capsys
+    number, code, said, error, image_folder, tmp_path, monkeypatch, capsys, request
 ):
     """As in a reader of weights, whose own code calls Python."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a shell's background
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
 
     def load(*args, **options):
         with pytest.raises(KeyboardInterrupt):

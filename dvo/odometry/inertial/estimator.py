@@ -86,6 +86,7 @@ FAILURES = 3
 MOST_PATIENCE = 2.0
 """Seconds from one estimate to the next where all that is known speaks against one."""
 _WAITING = ("too few poses", "too few samples")
+_UNCERTAIN = "the scale is uncertain"
 SURE_OFFSET, SURE_TURN = 3e-3, 0.5
 """Deviation of the time offset, seconds, and of rotations over a third of a second, degrees, of a gyroscope that tells
 the rotation within a readout."""
@@ -282,7 +283,7 @@ class InertialEstimator:
         self._adapt(found, led=self.leads)
         reason = self._doubt(problem, found)
         if not reason and worlds[-1] in self.worlds and found.scale_sigma > LOST_SCALE:
-            reason = f"the scale is uncertain by {100 * found.scale_sigma:.0f} %"
+            reason = f"{_UNCERTAIN} by {100 * found.scale_sigma:.0f} %"
         if reason:
             self._refuse(reason, time)
             return
@@ -496,7 +497,9 @@ class InertialEstimator:
             }  # fmt: skip
         return facts | ({"history": self.history} if self.history else {})
 
-    def settle(self, nodes: VisualNodes, worlds: list[int]) -> Smoothed | None:
+    def settle(
+        self, nodes: VisualNodes, worlds: list[int], confirm: Callable[[Smoothed], float] | None = None
+    ) -> Smoothed | None:
         """Estimate of a whole recording at its end, whose similarities are the final ones.
 
         The poses have been adjusted: their noise is estimated anew, and a recording that was never aligned may be now.
@@ -504,6 +507,8 @@ class InertialEstimator:
         Args:
             nodes: visual poses of the recording; of one segment, if there was no alignment.
             worlds: number of the world of each segment of the nodes.
+            confirm: relative deviation of the scale by a closer look at an estimate, for one that is not sure of it;
+                inf if that finds no solution. None: there is none.
 
         Returns:
             The estimate; None where there is none that passes the tests, and what was known before stays.
@@ -517,6 +522,7 @@ class InertialEstimator:
         if self.solution is None:
             problem.held = 0  # the origin is the place of the first camera
         found: Smoothed | None = None
+        sigma, unsure, reason = 0.0, False, ""
         try:
             for _ in range(ROUNDS):  # each with the noise that the one before has found
                 problem = replace(problem, options=replace(self._smoother, iterations=FINAL_ITERATIONS))
@@ -526,8 +532,17 @@ class InertialEstimator:
                     return None
                 self._adapt(found)
                 reason = self._doubt(problem, found)
-                if reason:
+                unsure = reason.startswith(_UNCERTAIN) and found.scale_sigma <= LOST_SCALE and confirm is not None
+                if reason and not unsure:
                     self.reason = self.reason if self.aligned else reason
+                    return None
+                if not unsure:
+                    self.solution, self._known = found, list(worlds)
+            if unsure:
+                assert confirm is not None and found is not None
+                sigma = confirm(found)
+                if sigma > self.options.max_scale_sigma:
+                    self.reason = reason
                     return None
                 self.solution, self._known = found, list(worlds)
         except (np.linalg.LinAlgError, _DisagreementError):
@@ -536,7 +551,7 @@ class InertialEstimator:
         if not self.aligned:
             self.state, self.reason, self._aligned = ScaleState.ALIGNED, "", float(found.times[-1])
             self.history.append(
-                {"time": self._aligned, "event": "aligned at the end", "scale_sigma": found.scale_sigma}
+                {"time": self._aligned, "event": "aligned at the end", "scale_sigma": sigma or found.scale_sigma}
             )
         self._take(found, worlds)
         return found
@@ -830,7 +845,7 @@ class InertialEstimator:
             if found.scale_sigma > NOTHING_TOLD:
                 return "the images show rotation, and too little translation with changes of speed"
             if found.scale_sigma > self.options.max_scale_sigma:
-                return f"the scale is uncertain by {100 * found.scale_sigma:.1f} %: move on, with changes of speed"
+                return f"{_UNCERTAIN} by {100 * found.scale_sigma:.1f} %: move on, with changes of speed"
             if found.gravity_sigma > MAX_GRAVITY_SIGMA:
                 return f"the vertical is uncertain by {found.gravity_sigma:.1f} degrees"
         return ""

@@ -24,9 +24,13 @@ from dvo.map.correction import Carried, Moved, apply_similarities, keyframes_of
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
 from dvo.odometry.frames.gate import Admitted
-from dvo.odometry.global_ba.rolling_shutter import Turns
+from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
+from dvo.odometry.global_ba.rolling_shutter import Shutter, Turns
+from dvo.odometry.inertial.adjustment import MOST_FRAMES, Adjusted, adjust_with_samples
 from dvo.odometry.inertial.coupling import InertialCoupling
 from dvo.odometry.inertial.estimator import (
+    AGREEMENT,
+    MAX_ERROR,
     BodyState,
     InertialEstimator,
     Similarity,
@@ -77,6 +81,7 @@ class InertialTracking:
         optimised: int = 8,
     ) -> None:  # fmt: skip
         self.options, self.graph, self.metric, self.active = options, graph, metric, False
+        self.variance = variance
         self._unused = ""  # why samples are not used
         self.estimator = InertialEstimator(options)
         self.coupling = InertialCoupling(self.estimator, self._similarity, variance, optimised)
@@ -240,13 +245,18 @@ class InertialTracking:
             map=replace(result.map, points=points),
         )  # fmt: skip
 
-    def settle(self, loops: LoopCloser) -> dict[str, Any]:
+    def settle(
+        self, loops: LoopCloser, adjustment: AdjustmentOptions | None = None, shutter: Shutter | None = None
+    ) -> dict[str, Any]:
         """Bring the map of a finished sequence to metres, and give frames that were bridged their poses.
 
-        Each keyframe follows the smoothed trajectory: where the scale of the images has drifted, its own is taken.
+        Each keyframe follows the smoothed trajectory: where the scale of the images has drifted, its own is taken. From
+        there on images and samples are solved for together (:mod:`dvo.odometry.inertial.adjustment`).
 
         Args:
             loops: whose measurements are scaled along.
+            adjustment: options of that; None: leave it out.
+            shutter: timing of the rows; None for a global shutter.
 
         Returns:
             Entries for run.json: ``inertial``, and ``scale``.
@@ -261,7 +271,17 @@ class InertialTracking:
         if not estimator.aligned and len(nodes):  # of the longest world alone
             longest = int(np.bincount(nodes.segment).argmax())
             nodes, worlds = nodes.of(longest), [worlds[longest]]
-        smoothed = estimator.settle(nodes, worlds) if len(nodes) else None
+        adjusted: Adjusted | None = None
+
+        def confirm(found: Smoothed) -> float:
+            """Deviation of the scale by the adjustment of a world that is not in metres yet."""
+            nonlocal adjusted
+            path = _path(found, nodes, np.ones(len(nodes), bool))
+            adjusted = self._adjusted(worlds[0], found, path, adjustment, shutter)
+            return np.inf if adjusted is None else adjusted.scale_sigma
+
+        closer = confirm if adjustment is not None and len(worlds) == 1 else None
+        smoothed = estimator.settle(nodes, worlds, closer) if len(nodes) else None
         if not estimator.aligned:
             return {"inertial": estimator.information()}
         # A segment may have been joined to an earlier world since its similarity was found.
@@ -273,20 +293,83 @@ class InertialTracking:
                 path = _path(smoothed, nodes, np.array(worlds)[nodes.segment] == world)
             units |= self._follow(world, _Path.constant(similarity) if path is None else path)
         loops.moved(Moved(units))
+        sigma = None if smoothed is None else smoothed.scale_sigma
         begun, entries = graph.recording.segment, []
         for world, similarity in sorted(found.items()):
             graph.metric[world] = "inertial"
             if world != min(found):
                 graph.join(world, min(found))
-            sigma = None if smoothed is None else smoothed.scale_sigma
             entries.append(
                 {"segment": world - begun, "source": "inertial", "factor": similarity.scale,
                  "deviation": sigma, "observations": len(nodes)}
             )  # fmt: skip
+        if smoothed is not None and found and adjusted is None:
+            adjusted = self._adjusted(min(found), smoothed, None, adjustment, shutter)
+        information = estimator.information()
+        if smoothed is not None and adjusted is not None:
+            loops.moved(Moved(self._place(adjusted)))
+            estimator.solution = smoothed = adjusted.states
+            information = estimator.information() | {"scale_sigma": adjusted.scale_sigma}
+            for entry in entries:
+                entry["deviation"] = adjusted.scale_sigma
         if smoothed is not None:
             self._fill(smoothed)
         scale = {"source": "inertial", "unit": "metres", "segments": entries}
-        return {"inertial": estimator.information(), **({"scale": scale} if entries else {})}
+        return {"inertial": information, **({"scale": scale} if entries else {})}
+
+    def _adjusted(
+        self, world: int, smoothed: Smoothed, path: _Path | None, options: AdjustmentOptions | None,
+        shutter: Shutter | None,
+    ) -> Adjusted | None:  # fmt: skip
+        """Solution of images and samples for a world.
+
+        Args:
+            world: its number.
+            smoothed: estimate to start from.
+            path: to metres; None for a world that is in metres.
+            options: of the final adjustment.
+            shutter: timing of the rows.
+
+        Returns:
+            None where there is none that agrees with both.
+        """
+        graph, samples, estimator = self.graph, self.estimator.stream.samples(), self.estimator
+        if options is None or samples is None:
+            return None
+        frames = graph.members(world)
+        dropped = len(frames) <= MOST_FRAMES
+        frames = frames if dropped else [frame for frame in frames if frame.anchor is None]
+        times = np.array([frame.timestamp for frame in frames])
+        if not 3 <= len(frames) <= MOST_FRAMES or not (np.diff(times) > 0).all():
+            return None
+        part = graph.problem(dropped, world).planned()
+        if not len(part.kk):
+            return None
+        if path is not None:
+            moved, scales = path.moved(times, se3.inverse(part.poses_cw).numpy())
+            depths = part.inverse_depths.view(len(times), -1) / torch.from_numpy(scales)[:, None]
+            part = part.with_values(poses_cw=se3.inverse(torch.from_numpy(moved)), inverse_depths=depths.flatten())
+        found = adjust_with_samples(
+            part, times, smoothed, samples, estimator.noise, estimator.translation_camera_imu, variance=self.variance,
+            spacing=self.options.interval, kernel=options.kernels[-1], max_residual=options.max_residual,
+            shutter=shutter,
+        )  # fmt: skip
+        # Where the two contradict each other, one of them is not what it seems.
+        if found is None or found.inertial_error > MAX_ERROR:
+            return None
+        return found if abs(found.change) <= AGREEMENT + 3 * smoothed.scale_sigma else None
+
+    def _place(self, adjusted: Adjusted) -> dict[int, float]:
+        """Move the keyframes of a solution; the new unit of each, in old ones."""
+        units: dict[int, float] = {}
+        for identifier, pose_cw, depths in zip(
+            adjusted.identifiers.tolist(), adjusted.poses_cw.numpy(), adjusted.depths.numpy(), strict=True
+        ):
+            before = self.graph.archive[identifier]
+            self.graph.correct(identifier, pose_cw, depths)
+            if before.anchor is None:
+                units[identifier] = float(np.median(depths / before.inverse_depth))
+        return units
 
     def corrected(self, carried: Carried) -> None:
         """Follow a correction of the map, after which each segment is in the world that it belongs to.

@@ -288,7 +288,9 @@ class PatchOdometry:
             config = replace(self.config, estimate_readout=self.config.estimate_readout and readout == 0)
             state.info |= finish_segments(self.graph, state, config, self.loops)
             state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
-            state.info |= self.inertial.settle(self.loops)
+            together = self.config.adjustment if self.config.final_adjustment else None
+            rows = replace(state.shutter, readout=readout or state.info.get("readout", 0.0))
+            state.info |= self.inertial.settle(self.loops, together, rows)
             if readout > 0:
                 state.info |= {"readout": readout, "readout_from": "gyroscope"}
         return replace(self._result({}), quality=state.quality)

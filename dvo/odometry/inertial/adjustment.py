@@ -9,6 +9,7 @@ visual-inertial adjustment of Campos et al., "ORB-SLAM3", 2021). Heading and pla
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -223,7 +224,7 @@ def _row(values: np.ndarray | list[float]) -> Tensor:
     return torch.tensor(np.asarray(values, np.float64))[None, None]
 
 
-def _moved(blocks: dict[str, StateBlock], found: GlobalBAResult) -> dict[str, StateBlock]:
+def _moved(blocks: Mapping[str, StateBlock], found: GlobalBAResult) -> dict[str, StateBlock]:
     return {name: block.with_value(found.blocks[name]) for name, block in blocks.items()}
 
 

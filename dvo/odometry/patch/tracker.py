@@ -289,7 +289,8 @@ class PatchOdometry:
             state.info |= finish_segments(self.graph, state, config, self.loops)
             state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
             together = self.config.adjustment if self.config.final_adjustment else None
-            rows = replace(state.shutter, readout=readout or state.info.get("readout", 0.0))
+            found = state.info.get("readout", 0.0)
+            rows = replace(state.shutter, readout=readout or (found if isinstance(found, float) else 0.0))
             state.info |= self.inertial.settle(self.loops, together, rows)
             if readout > 0:
                 state.info |= {"readout": readout, "readout_from": "gyroscope"}

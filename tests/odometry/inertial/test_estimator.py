@@ -319,6 +319,29 @@ def test_at_the_end_motion_that_does_not_tell_is_refused() -> None:
     assert not estimator.aligned and "acceleration" in estimator.reason
 
 
+def test_at_the_end_a_closer_look_decides_where_the_scale_is_uncertain() -> None:
+    recording, asked = record(9, seconds=9.0), []
+    options = InertialOptions(max_scale_sigma=1e-4)
+
+    def look(sigma: float, nodes: VisualNodes) -> InertialEstimator:
+        estimator = InertialEstimator(options)
+        estimator.add(recording.samples)
+        estimator.settle(nodes, [3], lambda found: asked.append(found.scale_sigma) or sigma)
+        return estimator
+
+    nodes = recording.nodes(0.1, 8.5)
+    refused = look(np.inf, nodes)
+    assert not refused.aligned and "the scale is uncertain" in refused.reason and not refused.worlds
+    sure = look(5e-5, nodes)
+    assert sure.aligned and sure.history[-1]["scale_sigma"] == 5e-5
+    assert sure.worlds[3].scale == pytest.approx(SCALE, rel=0.03)
+    assert len(asked) == 2 and min(asked) > options.max_scale_sigma
+    # Other doubts are none that a closer look takes away.
+    swapped = recording.with_samples(gyro=recording.samples.gyro[:, [1, 0, 2]])
+    recording = swapped
+    assert not look(5e-5, nodes).aligned and len(asked) == 2
+
+
 def test_the_gyroscope_tells_rotations_about_the_times_of_frames_without_an_alignment() -> None:
     recording = record(12, seconds=9.0, grade="phone")
     estimator = InertialEstimator(InertialOptions())

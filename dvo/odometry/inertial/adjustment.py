@@ -35,9 +35,12 @@ from dvo.odometry.inertial.smoother import GRAVITY, Smoothed
 
 MOST_FRAMES = 3000
 """Frames that are solved for at once; of more the kept keyframes alone, and of more of these none."""
-ROUNDS, ITERATIONS, TOLERANCE = 3, 12, 1e-4
+ROUNDS, ITERATIONS, TOLERANCE, SAME = 3, 12, 1e-5, 1e-4
 """Solutions, each with samples integrated with the biases of the one before and rows corrected for its motion; steps
-of each at most, and relative decrease of the cost at which it ends."""
+of each at most, relative decrease of the cost at which it ends, and from one solution to the next at which all do."""
+DAMPING = 1e-13
+"""At the start. Images hold each pose so much better than samples hold the size of all together that a usual damping,
+a fraction of the diagonal, would hold that."""
 VISUAL = 10.0
 """Variance of a measurement beyond that of the covariances of poses: aligned ones have ten times the network's weight,
 with errors that last from frame to frame."""
@@ -45,7 +48,6 @@ OFFSET_SIGMA = 5e-3
 """Of the time offset, about that of the smoother, seconds."""
 LEAST_TURN_SIGMA = 1e-5
 """Deviation of the rotation of an interval at least, rad."""
-_TINY = 1e-9  # damping of a solution for a covariance
 
 
 @dataclass(frozen=True)
@@ -112,13 +114,14 @@ def adjust_with_samples(
     fixed = torch.arange(count) == 0
     options = GlobalBAOptions(
         fixed, kernel, max_residual, depth_range=(1e-5, 1e3),
-        solver=LMOptions(max_iterations=ITERATIONS, tolerance=TOLERANCE),
+        solver=LMOptions(max_iterations=ITERATIONS, tolerance=TOLERANCE, damping=DAMPING),
     )  # fmt: skip
     sigma = float(np.sqrt(VISUAL * variance))
     extrinsics = pose_from(start.rotation_camera_imu, translation_camera_imu)
     poses, depths, frames = part.poses_cw, part.inverse_depths.view(count, -1), torch.arange(count)
     problem: PatchProblem = part
     found: GlobalBAResult | None = None
+    before = np.inf
     for _ in range(ROUNDS):
         problem = part
         if shutter is not None and shutter.readout > 0:
@@ -132,6 +135,9 @@ def adjust_with_samples(
         found = solve(problem, options)
         poses, depths = se3.normalise(found.poses_cw), found.patches[:, 2, 0, 0].view(count, -1)
         states = states.after(found)
+        if abs(before - found.cost) <= SAME * before:
+            break
+        before = found.cost
     assert found is not None
     problem = problem.with_values(poses_cw=poses, patches=found.patches, blocks=_moved(problem.blocks, found))
     if not (bool(torch.isfinite(poses).all()) and bool(torch.isfinite(depths).all())):
@@ -253,7 +259,7 @@ def _scale_deviation(problem: PatchProblem, options: GlobalBAOptions) -> float:
     gradient = torch.zeros_like(equations.g_p)
     free = slots < system.parts.count
     gradient[slots[free], :3] = by[free]
-    solved = replace(equations, g_p=gradient, g_l=torch.zeros_like(equations.g_l)).step(_TINY, options.solver)[0][0]
+    solved = replace(equations, g_p=gradient, g_l=torch.zeros_like(equations.g_l)).step(0.0, options.solver)[0][0]
     return float((gradient * solved).sum().clamp(min=0).sqrt())
 
 

@@ -85,6 +85,9 @@ FAILURES = 3
 """Estimates in a row that fail the tests, after which an alignment is withdrawn."""
 MOST_PATIENCE = 2.0
 """Seconds from one estimate to the next where all that is known speaks against one."""
+CLOSER = 0.5
+"""Share of the deviation of the scale that an alignment needs, where the adjustment of images and samples tells it: the
+noise of the images is assumed there, and errors of the camera's calibration are not in it."""
 _WAITING = ("too few poses", "too few samples")
 _UNCERTAIN = "the scale is uncertain"
 SURE_OFFSET, SURE_TURN = 3e-3, 0.5
@@ -541,7 +544,7 @@ class InertialEstimator:
             if unsure:
                 assert confirm is not None and found is not None
                 sigma = confirm(found)
-                if sigma > self.options.max_scale_sigma:
+                if sigma > CLOSER * self.options.max_scale_sigma:
                     self.reason = reason
                     return None
                 self.solution, self._known = found, list(worlds)

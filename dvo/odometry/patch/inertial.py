@@ -305,6 +305,7 @@ class InertialTracking:
             )  # fmt: skip
         if smoothed is not None and found and adjusted is None:
             adjusted = self._adjusted(min(found), smoothed, None, adjustment, shutter)
+            adjusted = adjusted if adjusted and adjusted.scale_sigma <= self.options.max_scale_sigma else None
         information = estimator.information()
         if smoothed is not None and adjusted is not None:
             loops.moved(Moved(self._place(adjusted)))

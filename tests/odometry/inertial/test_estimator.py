@@ -321,7 +321,7 @@ def test_at_the_end_motion_that_does_not_tell_is_refused() -> None:
 
 def test_at_the_end_a_closer_look_decides_where_the_scale_is_uncertain() -> None:
     recording, asked = record(9, seconds=9.0), []
-    options = InertialOptions(max_scale_sigma=1e-4)
+    options = InertialOptions(max_scale_sigma=2e-4)
 
     def look(sigma: float, nodes: VisualNodes) -> InertialEstimator:
         estimator = InertialEstimator(options)

@@ -9,6 +9,7 @@ visual-inertial adjustment of Campos et al., "ORB-SLAM3", 2021). Heading and pla
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -60,7 +61,7 @@ class Adjusted:
         depths: ``(N, M)`` inverse depths of the patches, 1/m.
         states: the start with the states of the nodes replaced, all in one segment with a scale of 1.
         change: logarithm of the size of the trajectory over that of the start.
-        scale_sigma: deviation of the logarithm of the size.
+        scale_sigma: deviation of the logarithm of the size; nan where it is not told.
         inertial_error: mean squared whitened residual of the preintegrated motion.
     """
 
@@ -140,7 +141,7 @@ def adjust_with_samples(
         before = found.cost
     assert found is not None
     problem = problem.with_values(poses_cw=poses, patches=found.patches, blocks=_moved(problem.blocks, found))
-    if not (bool(torch.isfinite(poses).all()) and bool(torch.isfinite(depths).all())):
+    if not math.isfinite(found.cost):
         return None
     error = _inertial_error(problem) / sigma**2
     upright = states.upright()
@@ -260,7 +261,7 @@ def _scale_deviation(problem: PatchProblem, options: GlobalBAOptions) -> float:
     free = slots < system.parts.count
     gradient[slots[free], :3] = by[free]
     solved = replace(equations, g_p=gradient, g_l=torch.zeros_like(equations.g_l)).step(0.0, options.solver)[0][0]
-    return float((gradient * solved).sum().clamp(min=0).sqrt())
+    return float((gradient * solved).sum().sqrt())
 
 
 def _spaced(times: np.ndarray, spacing: float) -> np.ndarray:

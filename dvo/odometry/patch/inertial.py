@@ -56,6 +56,8 @@ ANOTHER_CLOCK = 86400.0
 """Seconds between a sample and the newest frame that are no pause and no delay."""
 MOST_NODES = 400
 """Nodes of the estimate at the end of a sequence."""
+LEAST_EDGES = 12
+"""Measurements of a frame that takes part in the adjustment of images and samples."""
 SAME_TIME = 1e-6
 """Seconds."""
 
@@ -343,9 +345,13 @@ class InertialTracking:
         times = np.array([frame.timestamp for frame in frames])
         if not 3 <= len(frames) <= MOST_FRAMES or not (np.diff(times) > 0).all():
             return None
-        part = graph.problem(dropped, world).planned()
-        if not len(part.kk):
+        part = graph.problem(dropped, world).with_values(factors=())
+        # Frames whose measurements have been released to save memory stay.
+        counts = torch.bincount(torch.cat([part.ii, part.jj]), minlength=len(frames))
+        linked = counts >= LEAST_EDGES
+        if int(linked.sum()) < 3:
             return None
+        part, times = part.select(linked).planned(), times[linked.numpy()]
         if path is not None:
             moved, scales = path.moved(times, se3.inverse(part.poses_cw).numpy())
             depths = part.inverse_depths.view(len(times), -1) / torch.from_numpy(scales)[:, None]
@@ -356,7 +362,7 @@ class InertialTracking:
             shutter=shutter,
         )  # fmt: skip
         # Where the two contradict each other, one of them is not what it seems.
-        if found is None or found.inertial_error > MAX_ERROR:
+        if found is None or not found.inertial_error <= MAX_ERROR or not np.isfinite(found.scale_sigma):
             return None
         return found if abs(found.change) <= AGREEMENT + 3 * smoothed.scale_sigma else None
 

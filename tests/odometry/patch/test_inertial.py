@@ -11,12 +11,14 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from dvo.ba.patch_problem import PatchProblem
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.inertial import ImuNoise, InertialSamples
-from dvo.geometry import sim3
+from dvo.geometry import se3, sim3
 from dvo.geometry.poses import rotation_vector, so3_exp, split
 from dvo.odometry.global_ba.graph_adjustment import Adjusted
+from dvo.odometry.inertial.adjustment import Adjusted as Together
 from dvo.odometry.inertial.estimator import Similarity
 from dvo.odometry.inertial.smoother import GRAVITY, Similarities, Smoothed
 from dvo.odometry.patch.inertial import _led, _runs, _spaced, _turns_of
@@ -54,7 +56,7 @@ def align(odometry: PatchOdometry, time: float) -> None:
         np.eye(3), np.zeros(3), 1.0, covariance, 0.0, 0.0, np.zeros(2),
     )  # fmt: skip
     estimator.update = lambda nodes, worlds: None  # type: ignore[method-assign]
-    estimator.settle = lambda nodes, worlds: estimator.solution  # type: ignore[method-assign]
+    estimator.settle = lambda nodes, worlds, confirm: estimator.solution  # type: ignore[method-assign]
 
 
 def dark(images: list[Frame], first: int, last: int) -> list[Frame]:
@@ -178,6 +180,54 @@ def test_frames_after_a_dropped_keyframe_are_bridged_too() -> None:
             align(odometry, frame.timestamp)
     result = odometry.finish()
     assert len(result.inertial) == 2 and len(result.trajectory) == 24
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("size", "error", "sigma", "taken"),
+                         [(1.02, 1.0, 0.01, True), (1.02, 9.0, 0.01, False), (1.5, 1.0, 0.01, False),
+                          (1.02, 1.0, 0.2, False), (1.02, 1.0, np.nan, False)])  # fmt: skip
+def test_at_the_end_images_and_samples_decide_together(
+    size: float, error: float, sigma: float, taken: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[float] = []
+
+    def solved(part: PatchProblem, times: np.ndarray, start: Smoothed, *_: object, **given: object) -> Together:
+        """A world that is larger, about the same first camera."""
+        poses_wc = se3.inverse(part.poses_cw)
+        poses_wc[:, :3] = poses_wc[0, :3] + size * (poses_wc[:, :3] - poses_wc[0, :3])
+        seen.append(float(given["shutter"].readout))  # type: ignore[attr-defined]
+        depths = part.inverse_depths.view(len(times), -1) / size
+        return Together(part.identifiers, se3.inverse(poses_wc), depths, start, np.log(size), sigma, error)
+
+    results = []
+    for stub in (lambda *_, **__: None, solved):
+        monkeypatch.setattr("dvo.odometry.patch.inertial.adjust_with_samples", stub)
+        odometry = tracker()
+        for k, frame in enumerate(with_samples(frames(14))):
+            odometry.track(replace(frame, camera=replace(frame.camera, readout=0.01)))
+            if k == 9:
+                align(odometry, frame.timestamp)
+        results.append(odometry.finish())
+    alone, result = results
+    assert seen == [0.01]
+    told = result.info["inertial"]["scale_sigma"], result.info["scale"]["segments"][0]["deviation"]
+    assert (told == (sigma, sigma)) is taken
+    before, after = (run.trajectory.positions - run.trajectory.positions[0] for run in results)
+    np.testing.assert_allclose(after, (size if taken else 1.0) * before, atol=1e-5)
+    points = alone.map.points - alone.trajectory.positions[0]
+    larger = result.map.points - result.trajectory.positions[0]
+    np.testing.assert_allclose(larger, (size if taken else 1.0) * points, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.long
+def test_without_a_final_adjustment_there_is_none_with_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dvo.odometry.patch.inertial.adjust_with_samples", lambda *_, **__: 1 / 0)
+    odometry = tracker(replace(SMALL, final_adjustment=False))
+    for k, frame in enumerate(with_samples(frames(14))):
+        odometry.track(frame)
+        if k == 9:
+            align(odometry, frame.timestamp)
+    assert odometry.finish().metric
 
 
 @pytest.mark.long

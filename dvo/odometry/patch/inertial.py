@@ -25,8 +25,8 @@ from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
 from dvo.odometry.frames.gate import Admitted
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
+from dvo.odometry.global_ba.inertial_adjustment import MOST_FRAMES, Adjusted, adjust_with_samples
 from dvo.odometry.global_ba.rolling_shutter import Shutter, Turns
-from dvo.odometry.inertial.adjustment import MOST_FRAMES, Adjusted, adjust_with_samples
 from dvo.odometry.inertial.coupling import InertialCoupling
 from dvo.odometry.inertial.estimator import (
     AGREEMENT,
@@ -253,7 +253,7 @@ class InertialTracking:
         """Bring the map of a finished sequence to metres, and give frames that were bridged their poses.
 
         Each keyframe follows the smoothed trajectory: where the scale of the images has drifted, its own is taken. From
-        there on images and samples are solved for together (:mod:`dvo.odometry.inertial.adjustment`).
+        there on images and samples are solved for together (:mod:`dvo.odometry.global_ba.inertial_adjustment`).
 
         Args:
             loops: whose measurements are scaled along.

@@ -18,7 +18,7 @@ from dvo.data.inertial import ImuNoise, InertialSamples
 from dvo.geometry import se3, sim3
 from dvo.geometry.poses import rotation_vector, so3_exp, split
 from dvo.odometry.global_ba.graph_adjustment import Adjusted
-from dvo.odometry.inertial.adjustment import Adjusted as Together
+from dvo.odometry.global_ba.inertial_adjustment import Adjusted as Together
 from dvo.odometry.inertial.estimator import Similarity
 from dvo.odometry.inertial.smoother import GRAVITY, Similarities, Smoothed
 from dvo.odometry.patch.inertial import _led, _runs, _spaced, _turns_of

@@ -14,7 +14,7 @@ from dvo.data.inertial import InertialSamples
 from dvo.geometry import se3
 from dvo.geometry.poses import compose_poses, invert_poses, pose_from, so3_exp, split
 from dvo.geometry.projection import reproject
-from dvo.odometry.inertial.adjustment import VISUAL, Adjusted, adjust_with_samples
+from dvo.odometry.global_ba.inertial_adjustment import VISUAL, Adjusted, adjust_with_samples
 from dvo.odometry.inertial.smoother import Similarities, Smoothed
 from tests.support.inertial_motion import NOISE, Motion
 

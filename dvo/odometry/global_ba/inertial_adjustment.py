@@ -31,7 +31,7 @@ from dvo.geometry import se3, so3
 from dvo.geometry.poses import pose_from, split
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.inertial.factors import inertial_factors
-from dvo.odometry.inertial.preintegration import preintegrate
+from dvo.odometry.inertial.preintegration import Preintegration, preintegrate
 from dvo.odometry.inertial.smoother import GRAVITY, Smoothed
 
 MOST_FRAMES = 3000
@@ -47,6 +47,8 @@ VISUAL = 10.0
 with errors that last from frame to frame."""
 OFFSET_SIGMA = 5e-3
 """Of the time offset, about that of the smoother, seconds."""
+FASTEST = 1e3
+"""Deviation of a velocity that nothing may measure, between two gaps of the samples, m/s."""
 LEAST_TURN_SIGMA = 1e-5
 """Deviation of the rotation of an interval at least, rad."""
 
@@ -184,19 +186,24 @@ class _States:
         """Factors in units of measurements whose deviation is ``sigma``, and blocks; None without samples."""
         bias = self.bias.numpy()
         motion = preintegrate(samples, times + self.offset, bias[:-1, :3], bias[:-1, 3:], noise)
-        if not motion.covered.all():
+        covered = motion.covered
+        if not covered.any():
             return None
+        motion = Preintegration(**{name: value[covered] for name, value in vars(motion).items()})
         covariance = motion.covariance.copy()
         covariance[:, :3, :3] += LEAST_TURN_SIGMA**2 * np.eye(3)
-        first, at = torch.arange(len(nodes) - 1), torch.from_numpy(nodes)
+        first, at = torch.from_numpy(np.flatnonzero(covered)), torch.from_numpy(nodes)
         moves, walk = inertial_factors(
             replace(motion, covariance=covariance), noise, extrinsics, gravity=self.down.numpy(),
-            time_offset=self.offset, ii=at[:-1], jj=at[1:], state_i=first, state_j=first + 1,
+            time_offset=self.offset, ii=at[first], jj=at[first + 1], state_i=first, state_j=first + 1,
         )  # fmt: skip
+        # Nothing ties the biases after a gap to those before it.
+        begins = torch.from_numpy(np.flatnonzero(np.concatenate([[True], ~covered])))
         usual = np.repeat([noise.gyro_bias, noise.accel_bias], 3)
         priors = (
-            VectorPrior(IMU_BIAS, torch.zeros(1, 1, 6).double(), _row(sigma**2 / usual**2), first[:1]),
-            VectorPrior(TIME_OFFSET, _row([self.offset]), _row([sigma**2 / OFFSET_SIGMA**2]), first[:1]),
+            VectorPrior(IMU_BIAS, torch.zeros(1, 1, 6).double(), _row(sigma**2 / usual**2), begins),
+            VectorPrior(VELOCITY, self.velocity[None, begins], _row(np.full(3, sigma**2 / FASTEST**2)), begins),
+            VectorPrior(TIME_OFFSET, _row([self.offset]), _row([sigma**2 / OFFSET_SIGMA**2]), torch.zeros(1).long()),
         )
         blocks = inertial_blocks(
             self.velocity[None], self.bias[None], gravity=self.down[None],

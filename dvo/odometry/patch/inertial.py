@@ -367,16 +367,20 @@ class InertialTracking:
         return found if abs(found.change) <= AGREEMENT + 3 * smoothed.scale_sigma else None
 
     def _place(self, adjusted: Adjusted) -> dict[int, float]:
-        """Move the keyframes of a solution; the new unit of each, in old ones."""
-        units: dict[int, float] = {}
+        """Move the keyframes of a solution, and what is relative to them; the new unit of each, in old ones."""
+        graph, identifiers = self.graph, adjusted.identifiers.tolist()
+        before = [graph.archive[k] for k in identifiers]
+        kept = np.array([frame.anchor is None for frame in before])
+        changes = [float(np.median(d / f.inverse_depth)) for d, f in zip(adjusted.depths.numpy(), before, strict=True)]
+        scales = torch.tensor(changes, dtype=torch.float64)[kept, None]
+        poses = adjusted.poses_cw[kept]
+        similarities = torch.cat([poses[:, :3] * scales, poses[:, 3:], scales], 1)
+        apply_similarities(graph, adjusted.identifiers.numpy()[kept], similarities)
         for identifier, pose_cw, depths in zip(
-            adjusted.identifiers.tolist(), adjusted.poses_cw.numpy(), adjusted.depths.numpy(), strict=True
+            identifiers, adjusted.poses_cw.numpy(), adjusted.depths.numpy(), strict=True
         ):
-            before = self.graph.archive[identifier]
-            self.graph.correct(identifier, pose_cw, depths)
-            if before.anchor is None:
-                units[identifier] = float(np.median(depths / before.inverse_depth))
-        return units
+            graph.correct(identifier, pose_cw, depths)
+        return {k: change for k, change, own in zip(identifiers, changes, kept, strict=True) if own}
 
     def corrected(self, carried: Carried) -> None:
         """Follow a correction of the map, after which each segment is in the world that it belongs to.

@@ -157,3 +157,17 @@ def test_samples_that_end_early() -> None:
     assert torch.isfinite(found.poses_cw).all()
     case.samples = case.samples.between(0.0, 0.6)
     assert case.adjusted(*case.start(1.0, 0.0)) is None
+
+
+def test_samples_with_gaps() -> None:
+    case = Case(Motion(6, 0.8))
+    whole = case.adjusted(*case.start(1.1, 0.02))
+    times = case.samples.timestamps
+    kept = ~((times > 1.2) & (times < 1.5)) & ~((times > 1.62) & (times < 1.95))  # one node stands alone between them
+    case.samples = InertialSamples(times[kept], case.samples.gyro[kept], case.samples.accel[kept])
+    found = case.adjusted(*case.start(1.1, 0.02))
+    assert whole is not None
+    assert found is not None
+    assert found.change == pytest.approx(-np.log(1.1), abs=0.02)
+    assert found.scale_sigma > whole.scale_sigma
+    assert np.isfinite(found.states.velocity).all()

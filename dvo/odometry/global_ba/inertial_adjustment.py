@@ -20,7 +20,6 @@ from torch import Tensor
 from dvo.ba.blocks import GRAVITY as DOWN
 from dvo.ba.blocks import IMU_BIAS, POSES, TIME_OFFSET, VELOCITY, inertial_blocks
 from dvo.ba.factors import VectorPrior
-from dvo.ba.kernels import Kernel
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, StateBlock
 from dvo.ba.solve import solve
@@ -29,9 +28,10 @@ from dvo.ba.sparse.levenberg import LMOptions
 from dvo.data.inertial import ImuNoise, InertialSamples
 from dvo.geometry import se3, so3
 from dvo.geometry.poses import pose_from, split
+from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.inertial.factors import inertial_factors
-from dvo.odometry.inertial.preintegration import Preintegration, preintegrate
+from dvo.odometry.inertial.preintegration import preintegrate
 from dvo.odometry.inertial.smoother import GRAVITY, Smoothed
 
 MOST_FRAMES = 3000
@@ -45,6 +45,8 @@ a fraction of the diagonal, would hold that."""
 VISUAL = 10.0
 """Variance of a measurement beyond that of the covariances of poses: aligned ones have ten times the network's weight,
 with errors that last from frame to frame."""
+DEPTHS = (1e-5, 1e3)
+"""Range of inverse depths, 1/m."""
 OFFSET_SIGMA = 5e-3
 """Of the time offset, about that of the smoother, seconds."""
 FASTEST = 1e3
@@ -54,7 +56,7 @@ LEAST_TURN_SIGMA = 1e-5
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class VisualInertialSolution:
     """Solution of images and samples.
 
     Attributes:
@@ -82,26 +84,23 @@ def adjust_with_samples(
     start: Smoothed,
     samples: InertialSamples,
     noise: ImuNoise,
-    translation_camera_imu: np.ndarray,
     *,
     variance: float,
     spacing: float,
-    kernel: Kernel,
-    max_residual: float,
+    options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008 (frozen)
     shutter: Shutter | None = None,
-) -> Adjusted | None:
+) -> VisualInertialSolution | None:
     """Solve for a world by its images and samples.
 
     Args:
         part: measurements of all frames of the world, with poses and inverse depths in metres, upright, to start from.
         times: ``(N,)`` increasing, of the frames, seconds, clock of the camera.
-        start: velocities, biases, time offset and extrinsic rotation to start from.
+        start: velocities, biases, time offset and extrinsic calibration to start from; the last stays.
         samples: of the sensor.
         noise: of the samples.
-        translation_camera_imu: ``(3,)`` of the sensor in the camera, metres.
         variance: of a visual measurement of weight 1, feature pixels squared.
         spacing: of the nodes, seconds.
-        kernel, max_residual: of the measurements.
+        options: of the final adjustment: its last kernel, and the longest residual.
         shutter: timing of the rows; None for a global shutter.
 
     Returns:
@@ -115,12 +114,12 @@ def adjust_with_samples(
         return None
     states = _States.of(start, times[nodes])
     fixed = torch.arange(count) == 0
-    options = GlobalBAOptions(
-        fixed, kernel, max_residual, depth_range=(1e-5, 1e3),
+    settings = GlobalBAOptions(
+        fixed, options.kernels[-1], options.max_residual, depth_range=DEPTHS,
         solver=LMOptions(max_iterations=ITERATIONS, tolerance=TOLERANCE, damping=DAMPING),
     )  # fmt: skip
     sigma = float(np.sqrt(VISUAL * variance))
-    extrinsics = pose_from(start.rotation_camera_imu, translation_camera_imu)
+    extrinsics = pose_from(start.rotation_camera_imu, -start.rotation_camera_imu @ start.lever)
     poses, depths, frames = part.poses_cw, part.inverse_depths.view(count, -1), torch.arange(count)
     problem: PatchProblem = part
     found: GlobalBAResult | None = None
@@ -135,7 +134,7 @@ def adjust_with_samples(
             return None
         factors, blocks = given
         problem = problem.with_values(poses_cw=poses, inverse_depths=depths.flatten(), factors=factors, blocks=blocks)
-        found = solve(problem, options)
+        found = solve(problem, settings)
         poses, depths = se3.normalise(found.poses_cw), found.patches[:, 2, 0, 0].view(count, -1)
         states = states.after(found)
         if abs(before - found.cost) <= SAME * before:
@@ -150,8 +149,10 @@ def adjust_with_samples(
     poses_wc = se3.compose(upright.expand(count, 7), se3.inverse(poses))
     smoothed = states.smoothed(start, times[nodes], split(poses_wc.numpy()[nodes]), split(upright.numpy())[0])
     change = float(torch.log(_size(se3.inverse(poses)) / _size(se3.inverse(part.poses_cw))))
-    sigma_scale = sigma * _scale_deviation(problem, options)
-    return Adjusted(part.identifiers, se3.inverse(poses_wc), depths, smoothed, change, sigma_scale, error)
+    sigma_scale = sigma * _scale_deviation(problem, settings)
+    return VisualInertialSolution(
+        part.identifiers, se3.inverse(poses_wc), depths, smoothed, change, sigma_scale, error
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -189,7 +190,7 @@ class _States:
         covered = motion.covered
         if not covered.any():
             return None
-        motion = Preintegration(**{name: value[covered] for name, value in vars(motion).items()})
+        motion = motion.where(covered)
         covariance = motion.covariance.copy()
         covariance[:, :3, :3] += LEAST_TURN_SIGMA**2 * np.eye(3)
         first, at = torch.from_numpy(np.flatnonzero(covered)), torch.from_numpy(nodes)

@@ -145,7 +145,7 @@ class InertialCoupling:
         if not covered.any():
             return None
         first, scale = begin + np.flatnonzero(covered), similarity.scale
-        motion = _where(motion, covered)
+        motion = motion.where(covered)
         late = max(float(np.sqrt(solution.covariance[NODE, NODE])), LEAST_SHIFT)
         change = late * (motion.rates[:, 1] - motion.rates[:, 0])
         covariance = motion.covariance.copy()
@@ -167,10 +167,6 @@ class InertialCoupling:
             motion, first, similarity.rotation.T @ start.velocity / scale, float(speed) / scale**2,
             np.concatenate(bias), bias_variance, similarity.rotation.T @ GRAVITY / scale, extrinsics,
         )  # fmt: skip
-
-
-def _where(motion: Preintegration, keep: np.ndarray) -> Preintegration:
-    return Preintegration(**{name: value[keep] for name, value in vars(motion).items()})
 
 
 def _on(factor: Factor, device: torch.device) -> Factor:

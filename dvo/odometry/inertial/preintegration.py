@@ -64,6 +64,10 @@ class Preintegration:
     def __len__(self) -> int:
         return len(self.duration)
 
+    def where(self, keep: Array) -> Preintegration:
+        """Intervals that are chosen by a mask ``(K,)``."""
+        return Preintegration(**{name: value[keep] for name, value in vars(self).items()})
+
     @property
     def covered(self) -> Array:
         """``(K,)`` bool, intervals that the samples cover."""

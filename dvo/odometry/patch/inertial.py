@@ -25,7 +25,7 @@ from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
 from dvo.odometry.frames.gate import Admitted
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
-from dvo.odometry.global_ba.inertial_adjustment import MOST_FRAMES, Adjusted, adjust_with_samples
+from dvo.odometry.global_ba.inertial_adjustment import MOST_FRAMES, VisualInertialSolution, adjust_with_samples
 from dvo.odometry.global_ba.rolling_shutter import Shutter, Turns
 from dvo.odometry.inertial.coupling import InertialCoupling
 from dvo.odometry.inertial.estimator import (
@@ -273,7 +273,7 @@ class InertialTracking:
         if not estimator.aligned and len(nodes):  # of the longest world alone
             longest = int(np.bincount(nodes.segment).argmax())
             nodes, worlds = nodes.of(longest), [worlds[longest]]
-        adjusted: Adjusted | None = None
+        adjusted: VisualInertialSolution | None = None
 
         def confirm(found: Smoothed) -> float:
             """Deviation of the scale by the adjustment of a world that is not in metres yet."""
@@ -323,7 +323,7 @@ class InertialTracking:
     def _adjusted(
         self, world: int, smoothed: Smoothed, path: _Path | None, options: AdjustmentOptions | None,
         shutter: Shutter | None,
-    ) -> Adjusted | None:  # fmt: skip
+    ) -> VisualInertialSolution | None:  # fmt: skip
         """Solution of images and samples for a world.
 
         Args:
@@ -357,16 +357,15 @@ class InertialTracking:
             depths = part.inverse_depths.view(len(times), -1) / torch.from_numpy(scales)[:, None]
             part = part.with_values(poses_cw=se3.inverse(torch.from_numpy(moved)), inverse_depths=depths.flatten())
         found = adjust_with_samples(
-            part, times, smoothed, samples, estimator.noise, estimator.translation_camera_imu, variance=self.variance,
-            spacing=self.options.interval, kernel=options.kernels[-1], max_residual=options.max_residual,
-            shutter=shutter,
+            part, times, smoothed, samples, estimator.noise, variance=self.variance, spacing=self.options.interval,
+            options=options, shutter=shutter,
         )  # fmt: skip
         # Where the two contradict each other, one of them is not what it seems.
         if found is None or not found.inertial_error <= MAX_ERROR or not np.isfinite(found.scale_sigma):
             return None
         return found if abs(found.change) <= AGREEMENT + 3 * smoothed.scale_sigma else None
 
-    def _place(self, adjusted: Adjusted) -> dict[int, float]:
+    def _place(self, adjusted: VisualInertialSolution) -> dict[int, float]:
         """Move the keyframes of a solution, and what is relative to them; the new unit of each, in old ones."""
         graph, identifiers = self.graph, adjusted.identifiers.tolist()
         before = [graph.archive[k] for k in identifiers]

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from dvo.ba.kernels import Kernel
 from dvo.ba.patch_problem import PatchProblem
 from dvo.data.inertial import InertialSamples
 from dvo.geometry import se3
 from dvo.geometry.poses import compose_poses, invert_poses, pose_from, so3_exp, split
 from dvo.geometry.projection import reproject
-from dvo.odometry.global_ba.inertial_adjustment import VISUAL, Adjusted, adjust_with_samples
+from dvo.odometry.global_ba.inertial_adjustment import VISUAL, VisualInertialSolution, adjust_with_samples
 from dvo.odometry.inertial.smoother import Similarities, Smoothed
 from tests.support.inertial_motion import NOISE, Motion
 
@@ -83,10 +82,9 @@ class Case:
 
     def adjusted(
         self, part: PatchProblem, start: Smoothed, variance: float = 0.01 / VISUAL, spacing: float = 0.2
-    ) -> Adjusted | None:
+    ) -> VisualInertialSolution | None:
         return adjust_with_samples(
-            part, self.times, start, self.samples, NOISE, LEVER, variance=variance, spacing=spacing,
-            kernel=Kernel("cauchy", 0.1), max_residual=32.0,
+            part, self.times, start, self.samples, NOISE, variance=variance, spacing=spacing
         )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from dvo.data.inertial import ImuNoise, InertialSamples
 from dvo.geometry import se3, sim3
 from dvo.geometry.poses import rotation_vector, so3_exp, split
 from dvo.odometry.global_ba.graph_adjustment import Adjusted
-from dvo.odometry.global_ba.inertial_adjustment import Adjusted as Together
+from dvo.odometry.global_ba.inertial_adjustment import VisualInertialSolution as Solution
 from dvo.odometry.inertial.estimator import Similarity
 from dvo.odometry.inertial.smoother import GRAVITY, Similarities, Smoothed
 from dvo.odometry.patch.inertial import _led, _runs, _spaced, _turns_of
@@ -191,13 +192,17 @@ def test_at_the_end_images_and_samples_decide_together(
 ) -> None:
     seen: list[float] = []
 
-    def solved(part: PatchProblem, times: np.ndarray, start: Smoothed, *_: object, **given: object) -> Together:
+    def solved(
+        part: PatchProblem, times: np.ndarray, start: Smoothed, *_: object, **given: object
+    ) -> VisualInertialSolution:
         """A world that is larger, about the same first camera."""
         poses_wc = se3.inverse(part.poses_cw)
         poses_wc[:, :3] = poses_wc[0, :3] + size * (poses_wc[:, :3] - poses_wc[0, :3])
-        seen.append(float(given["shutter"].readout))  # type: ignore[attr-defined]
+        seen.append(float(given["shutter"].readout))
         depths = part.inverse_depths.view(len(times), -1) / size
-        return Together(part.identifiers, se3.inverse(poses_wc), depths, start, np.log(size), sigma, error)
+        return VisualInertialSolution(
+            part.identifiers, se3.inverse(poses_wc), depths, start, np.log(size), sigma, error
+        )
 
     results = []
     for stub in (lambda *_, **__: None, solved):

@@ -192,17 +192,13 @@ def test_at_the_end_images_and_samples_decide_together(
 ) -> None:
     seen: list[float] = []
 
-    def solved(
-        part: PatchProblem, times: np.ndarray, start: Smoothed, *_: object, **given: object
-    ) -> VisualInertialSolution:
+    def solved(part: PatchProblem, times: np.ndarray, start: Smoothed, *_: object, **given: Any) -> Solution:
         """A world that is larger, about the same first camera."""
         poses_wc = se3.inverse(part.poses_cw)
         poses_wc[:, :3] = poses_wc[0, :3] + size * (poses_wc[:, :3] - poses_wc[0, :3])
         seen.append(float(given["shutter"].readout))
         depths = part.inverse_depths.view(len(times), -1) / size
-        return VisualInertialSolution(
-            part.identifiers, se3.inverse(poses_wc), depths, start, np.log(size), sigma, error
-        )
+        return Solution(part.identifiers, se3.inverse(poses_wc), depths, start, np.log(size), sigma, error)
 
     results = []
     for stub in (lambda *_, **__: None, solved):

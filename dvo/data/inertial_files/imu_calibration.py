@@ -96,26 +96,57 @@ def read_imu_calibration(given: str | Path | Sequence[str | Path]) -> ImuCalibra
 
     Args:
         given: file, ``FILE:N`` for camera N of a camchain (the first by default), or the name of one of
-            :data:`dvo.data.inertial.NOISE_PRESETS`; or several of them.
+            :data:`dvo.data.inertial.NOISE_PRESETS`; or several of them. EuRoC's ``sensor.yaml`` of the camera and that
+            of the inertial sensor place both on one body (``T_BS``).
 
     Raises:
         DvoError: nothing of that name; a file that states nothing of an inertial sensor; numbers that cannot be; an
             entry that looks like calibration and was not used; two files that state the same.
     """
-    found = ImuCalibration()
-    for one in [given] if isinstance(given, str | Path) else given:
-        new = _read(str(one))
+    found, files = ImuCalibration(), [str(one) for one in ([given] if isinstance(given, str | Path) else given)]
+    bodies: dict[str, tuple[str, np.ndarray]] = {}
+    for one in files:
+        new, body = _read(one)
+        if body is not None and body[0] in bodies:
+            raise DvoError("is stated twice", file=one, field="T_BS", remedy="give one camera, and one inertial sensor")
+        bodies |= {} if body is None else {body[0]: (one, body[1])}
         for name in ("noise", "T_camera_imu", "time_offset"):
             if getattr(new, name) is not None and getattr(found, name) is not None:
                 raise DvoError("is stated twice", file=one, field=name, remedy="leave out one of the files")
         found = new.over(found)
-    return found
+    return _on_one_body(bodies, found)
 
 
-def _read(given: str) -> ImuCalibration:
+def _on_one_body(bodies: dict[str, tuple[str, np.ndarray]], found: ImuCalibration) -> ImuCalibration:
+    """A calibration with what the poses of both sensors on one body tell."""
+    camera, sensor = bodies.get("camera"), bodies.get("imu")
+    if camera is None:
+        if sensor is None or np.allclose(sensor[1], [0, 0, 0, 0, 0, 0, 1], atol=1e-9):
+            return found
+        message, file = "places the sensor on a body, whose pose in the camera is not stated", sensor[0]
+        remedy = "give sensor.yaml of the camera too, or T_camera_imu in a YAML file"
+        raise DvoError(message, file=file, field="T_BS", remedy=remedy)
+    if sensor is None:
+        message = "places the camera on a body, on which the inertial sensor has no place"
+        raise DvoError(message, file=camera[0], field="T_BS", remedy="give sensor.yaml of the inertial sensor too")
+    if found.T_camera_imu is not None:
+        raise DvoError("is stated twice", file=camera[0], field="T_camera_imu", remedy="leave out one of the files")
+    pose = compose_poses(invert_poses(camera[1]), sensor[1])
+    _check_arm(pose, camera[0], "T_BS")
+    return replace(found, T_camera_imu=pose)
+
+
+def _check_arm(pose: np.ndarray, file: str | Path, field: str) -> None:
+    if np.linalg.norm(pose[:3]) > LONGEST_ARM:
+        message = f"the sensor is {np.linalg.norm(pose[:3]):.4g} m from the camera"
+        raise DvoError(message, file=file, field=field, remedy="give metres")
+
+
+def _read(given: str) -> tuple[ImuCalibration, tuple[str, np.ndarray] | None]:
+    """What a file states; and a sensor, ``camera`` or ``imu``, with its pose on a body."""
     path, camera = Path(given), None
     if not is_file(path) and given in NOISE_PRESETS:
-        return ImuCalibration(NOISE_PRESETS[given])
+        return ImuCalibration(NOISE_PRESETS[given]), None
     head, _, number = given.rpartition(":")
     if not is_file(path) and head and number.isdigit():
         path, camera = Path(head), f"cam{int(number)}"
@@ -123,14 +154,16 @@ def _read(given: str) -> ImuCalibration:
     if not isinstance(data, dict):
         raise DvoError("no mapping in it", file=path, remedy=_REMEDY)
     entries = _Entries(_flat(data, camera, path), path)
-    found = _of_entries(entries)
+    found, on_body = _of_entries(entries), entries.pose("T_BS")
     entries.check_used()
-    if found.T_camera_imu is not None and np.linalg.norm(found.T_camera_imu[:3]) > LONGEST_ARM:
-        message = f"the sensor is {np.linalg.norm(found.T_camera_imu[:3]):.4g} m from the camera"
-        raise DvoError(message, file=path, field="T_camera_imu", remedy="give metres")
-    if found.noise is None and found.T_camera_imu is None and found.time_offset is None:
+    if found.T_camera_imu is not None:
+        _check_arm(found.T_camera_imu, path, "T_camera_imu")
+    kind = "camera" if entries.values.get("sensor_type", "") == "camera" or "camera_model" in entries.values else "imu"
+    body = None if on_body is None else (kind, on_body)
+    states = (found.noise, found.T_camera_imu, found.time_offset)
+    if all(part is None for part in states) and (body is None or kind == "imu"):
         raise DvoError("states nothing of an inertial sensor", file=path, remedy=_REMEDY)
-    return found
+    return found, body
 
 
 def _flat(data: dict[Any, Any], camera: str | None, path: Path) -> dict[str, Any]:
@@ -248,10 +281,6 @@ def _extrinsics(entries: _Entries) -> np.ndarray | None:
     """``T_camera_imu`` of an entry of that meaning."""
     found = [(name, entries.pose(name)) for name in ("T_camera_imu", "T_cam_imu", "T_imu_cam", "T_imu_camera")]
     stated = [(name, pose) for name, pose in found if pose is not None]
-    body = entries.pose("T_BS")
-    if body is not None and not np.allclose(body, [0, 0, 0, 0, 0, 0, 1], atol=1e-9):
-        message = "places the sensor on a body, whose pose in the camera is not stated"
-        raise DvoError(message, file=entries.path, field="T_BS", remedy="give T_camera_imu in a YAML file")
     rest = entries.pose("T_i_b")  # Kalibr's, of the sensors of several in the first one
     if rest is not None and not np.allclose(rest, [0, 0, 0, 0, 0, 0, 1], atol=1e-9):
         raise DvoError("is not the identity", file=entries.path, field="T_i_b", remedy="give the file of one sensor")

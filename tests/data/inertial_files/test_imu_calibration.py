@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dvo.core.errors import DvoError
 from dvo.data.inertial import NOISE_PRESETS, InertialSamples
 from dvo.data.inertial_files.imu_calibration import ImuCalibration, read_imu_calibration, read_noise
-from dvo.geometry.poses import compose_poses, invert_poses
+from dvo.geometry.poses import compose_poses, invert_poses, so3_exp, split
 
 DENSITIES = """accelerometer_noise_density: 0.002
 accelerometer_random_walk: 0.003
@@ -70,6 +70,35 @@ def test_sensor_yaml_of_euroc(tmp_path):
     moved = write(tmp_path, f"{text}{np.array(TURN).ravel().tolist()}\n{DENSITIES}", "other.yaml")
     with pytest.raises(DvoError, match="T_BS: places the sensor on a body"):
         read_imu_calibration(moved)
+
+
+def placed(sensor: str, pose: np.ndarray, rest: str = "") -> str:
+    return f"sensor_type: {sensor}\nT_BS:\n  cols: 4\n  rows: 4\n  data: {pose.ravel().tolist()}\n{rest}"
+
+
+def test_camera_and_sensor_on_one_body(tmp_path):
+    turn, camera = np.array(TURN), np.eye(4)
+    camera[:3, 3] = 0.1, -0.2, 0.05
+    camera[:3, :3] = so3_exp(np.array([0.3, -0.4, 0.2]))
+    seen = write(tmp_path, placed("camera", camera, "intrinsics: [400, 400, 300, 200]\n"), "cam0.yaml")
+    sensor = write(tmp_path, placed("imu", turn, DENSITIES), "imu0.yaml")
+    for pair in ([seen, sensor], [sensor, seen]):
+        found = read_imu_calibration(pair)
+        assert found.noise is not None and found.T_camera_imu is not None
+        rotation, position = split(found.T_camera_imu)
+        expected = np.linalg.inv(camera) @ turn
+        assert np.allclose(rotation, expected[:3, :3]) and np.allclose(position, expected[:3, 3])
+    with pytest.raises(DvoError, match=r"cam0\.yaml: T_BS: places the camera on a body.*sensor\.yaml of the inertial"):
+        read_imu_calibration(seen)
+    with pytest.raises(DvoError, match=r"T_BS: is stated twice"):
+        read_imu_calibration([seen, sensor, write(tmp_path, placed("camera", camera), "cam1.yaml")])
+    stated = write(tmp_path, f"T_camera_imu: {turn.ravel().tolist()}\n", "own.yaml")
+    with pytest.raises(DvoError, match="T_camera_imu: is stated twice"):
+        read_imu_calibration([seen, sensor, stated])
+    camera[0, 3] = 150.0
+    far = write(tmp_path, placed("camera", camera), "millimetres.yaml")
+    with pytest.raises(DvoError, match=r"T_BS: the sensor is 149.9 m from the camera"):
+        read_imu_calibration([far, sensor])
 
 
 @pytest.mark.parametrize("factor", [1, 10])

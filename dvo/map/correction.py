@@ -118,6 +118,113 @@ def keyframes_of(graph: Map, segment: int) -> np.ndarray:
     return np.array([k for k in kept if graph.segment_of(k) >= 0 and graph.world_of(graph.segment_of(k)) == world], int)
 
 
+def set_solution(
+    graph: KeyframeGraph, world: int, identifiers: np.ndarray, poses_cw: Tensor, inverse_depths: np.ndarray
+) -> Moved:
+    """Give keyframes of a world the poses and depths of a solution, those in the window included.
+
+    Keyframes that were not solved for keep their place relative to the last solved one before them, or to the first.
+
+    Args:
+        graph: its keyframes and window are changed; keyframes may have been archived, or added, since the solution was
+            begun.
+        world: number of the world.
+        identifiers: ``(N,)`` increasing, of the keyframes that were solved for, dropped ones included.
+        poses_cw: ``(N, 7)`` float64 world to camera.
+        inverse_depths: ``(N, M)`` of their patches.
+
+    Returns:
+        What has moved: kept keyframes.
+    """
+    window, m, here = graph.window, graph.per_frame, graph.world_of(graph.segment) == world
+    places = {frame.identifier: p for p, frame in enumerate(window.frames) if here and not frame.guest}
+    archived = keyframes_of(graph, world)
+    kept = np.concatenate([archived, np.array(list(places), int)])
+    rows = {int(k): row for row, k in enumerate(identifiers)}
+    solved = np.array([k for k, identifier in enumerate(kept.tolist()) if identifier in rows], int)
+    if not len(solved):
+        return Moved({})
+    centre = window.patches.shape[-1] // 2
+    known = window.patches[:, 2, centre, centre].double().cpu().numpy().reshape(-1, m)
+    before = torch.cat([graph.poses_cw(archived), window.poses_cw[list(places.values())].double().cpu()])
+    similarities = torch.zeros(len(kept), 8, dtype=torch.float64)
+    for k in solved.tolist():
+        identifier = int(kept[k])
+        old = known[places[identifier]] if identifier in places else graph.archive[identifier].inverse_depth
+        unit = float(np.median(inverse_depths[rows[identifier]] / old)) if len(old) else 1.0
+        similarities[k] = sim3.from_se3(_in_unit(poses_cw[rows[identifier]], unit), unit)
+    carriers = solved[(np.searchsorted(solved, np.arange(len(kept)), "right") - 1).clip(min=0)]
+    rest = np.setdiff1d(np.arange(len(kept)), solved)
+    relative = se3.relative(before[carriers[rest]], before[rest])
+    similarities[rest] = sim3.compose(sim3.from_se3(relative), similarities[carriers[rest]])
+    apply_similarities(graph, archived, similarities[: len(archived)])
+    units = dict(zip(kept.tolist(), similarities[:, 7].tolist(), strict=True))
+    _set_window(graph, places, similarities[len(archived) :], {k: inverse_depths[rows[k]] for k in places if k in rows})
+    placed = dict(zip(kept.tolist(), (similarities[:, :7] / _unit_of(similarities)), strict=True))
+    for identifier, row in sorted(rows.items()):  # the keyframe that a dropped one is relative to comes first
+        if identifier not in places and identifier in graph.archive:
+            _set_archived(graph, identifier, poses_cw[row], inverse_depths[row], placed)
+    if not here:
+        return Moved(units)
+    change = sim3.compose(sim3.inverse(similarities[-1]), sim3.from_se3(before[-1]))
+    newest = int(kept[solved[-1]])
+    time = window.frames[places[newest]].timestamp if newest in places else graph.archive[newest].timestamp
+    return Moved(units, (Carried(world, change, time, window=True),))
+
+
+def _in_unit(pose_cw: Tensor, unit: float) -> Tensor:
+    return torch.cat([pose_cw[:3] * unit, pose_cw[3:]])
+
+
+def _unit_of(similarities: Tensor) -> Tensor:
+    """Divisors ``(N, 7)`` that make poses of similarities."""
+    return torch.cat([similarities[:, 7:].expand(-1, 3), torch.ones(len(similarities), 4, dtype=torch.float64)], 1)
+
+
+def _set_window(
+    graph: KeyframeGraph, places: Mapping[int, int], similarities: Tensor, solved: Mapping[int, np.ndarray]
+) -> None:
+    """Move keyframes of the window, and what is relative to them; those that were solved for take their depths."""
+    window, m, centre = graph.window, graph.per_frame, graph.window.patches.shape[-1] // 2
+    poses, patches = window.poses_cw.clone(), window.patches.clone()
+    units = similarities[:, 7]
+    for (identifier, place), similarity in zip(places.items(), similarities, strict=True):
+        own, unit = patches[place * m : (place + 1) * m, 2], float(similarity[7])
+        pose = torch.cat([similarity[:3] / unit, similarity[3:7]])
+        poses[place] = se3.normalise(pose).to(poses)
+        if identifier in solved:
+            own *= (torch.from_numpy(solved[identifier]).to(own) / own[:, centre, centre])[:, None, None]
+        else:
+            own *= unit
+    window.poses_cw, window.patches = poses, patches
+    _rescale_relative(graph, dict(zip(places, units.tolist(), strict=True)))
+
+
+def _set_archived(
+    graph: Map, identifier: int, pose_cw: Tensor, inverse_depth: np.ndarray, placed: dict[int, Tensor]
+) -> None:
+    """Set pose and depths of an archived keyframe; ``placed``: poses of the kept ones, and those that are set."""
+    frame = graph.archive[identifier]
+    depths = inverse_depth.astype(np.float32) if len(frame.inverse_depth) else frame.inverse_depth
+    placed[identifier] = pose_cw
+    if frame.anchor is None:
+        graph.correct(identifier, pose_cw.numpy(), depths)
+        return
+    anchor_cw = _placed(graph, frame.anchor, placed)
+    relative = se3.relative(anchor_cw, pose_cw).numpy()
+    graph.archive.set_pose(identifier, relative, depths, frame.anchor)
+    graph.log.reanchor(identifier, frame.anchor, relative)
+
+
+def _placed(graph: Map, identifier: int, placed: Mapping[int, Tensor]) -> Tensor:
+    """Pose ``(7,)`` of a keyframe whose chain of keyframes that it is relative to may end in the window."""
+    if identifier in placed:
+        return placed[identifier]
+    frame = graph.archive[identifier]
+    own = torch.from_numpy(frame.pose_cw)
+    return own if frame.anchor is None else se3.compose(own, _placed(graph, frame.anchor, placed))
+
+
 def move_window(graph: KeyframeGraph, before_cw: Tensor, similarity: Tensor) -> None:
     """Move the window along with a keyframe outside of it, and the keyframes that were dropped from it.
 

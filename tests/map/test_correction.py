@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from dvo.geometry import se3, sim3
 from dvo.geometry.projection import reproject
-from dvo.map.correction import apply_similarities, move_window, similarity_between
+from dvo.map.correction import apply_similarities, move_window, set_solution, similarity_between
 from tests.support.archived_walk import archived_walk
 
 TANGENT = st.lists(st.floats(-1, 1), min_size=7, max_size=7).map(lambda xi: torch.tensor(xi, dtype=torch.float64))
@@ -106,6 +106,70 @@ def test_keyframes_dropped_from_the_window_keep_their_place_in_it():
     ratio = np.linalg.norm(np.diff(after, axis=0), axis=1) / np.linalg.norm(np.diff(before, axis=0), axis=1)
     assert np.allclose(ratio, np.exp(-0.7), atol=1e-4)
     assert np.allclose(graph.archive[4].inverse_depth, depth * np.exp(0.7))
+
+
+def half_archived(dropped=(4, 5, 9)):
+    """A walk whose later half is in the window: keyframe 9 has left that, and is relative to one in it."""
+    graph, _ = archived_walk(frames=14, dropped=dropped, archived=False)
+    for _ in range(5):
+        graph.archive_oldest()
+    return graph
+
+
+def solved(graph):
+    """Identifiers, poses and depths of all keyframes, as they are."""
+    whole = graph.copy()
+    whole.archive_window()
+    identifiers = np.array([keyframe.identifier for keyframe in whole.archive])
+    return identifiers, whole.poses_cw(identifiers), np.stack([whole.archive[k].inverse_depth for k in identifiers])
+
+
+def moved_by(change, poses_cw, depths):
+    similarities = sim3.compose(sim3.from_se3(poses_cw), sim3.inverse(change))
+    return torch.cat([similarities[:, :3] / similarities[:, 7:], similarities[:, 3:7]], 1), depths / float(change[7])
+
+
+@settings(max_examples=10, deadline=None)
+@given(TANGENT)
+def test_map_and_window_take_a_solution(xi):
+    graph, change = half_archived(), sim3.exp(0.5 * xi)
+    identifiers, poses_cw, depths = solved(graph)
+    poses_cw, depths = moved_by(change, poses_cw, depths)
+    moved = set_solution(graph, 0, identifiers, poses_cw, depths)
+    again, found, inverse = solved(graph)
+    assert again.tolist() == identifiers.tolist() and len(graph.window) == 6
+    assert torch.allclose(found[:, :3], poses_cw[:, :3], atol=1e-4)
+    assert torch.allclose((found[:, 3:] * poses_cw[:, 3:]).sum(1).abs(), torch.ones(14).double(), atol=1e-6)
+    assert np.allclose(inverse, depths, rtol=1e-5)
+    assert np.allclose(list(moved.units.values()), 1 / float(change[7]), rtol=1e-5) and len(moved.units) == 11
+    (carried,) = moved.worlds
+    assert carried.window and carried.time == graph.window.frames[-1].timestamp
+    assert torch.allclose(carried.change[:3], change[:3], atol=1e-3)
+    assert torch.allclose(carried.change[7], change[7], rtol=1e-5)
+
+
+def test_keyframes_without_a_solution_go_with_their_neighbours():
+    """Of a solution of the middle alone, earlier and later ones keep their place beside it."""
+    graph, change = half_archived(), sim3.exp(torch.tensor([0.3, -0.2, 0.1, 0.2, 0.1, -0.3, 0.4], dtype=torch.float64))
+    identifiers, poses_cw, depths = solved(graph)
+    wanted = moved_by(change, poses_cw, depths)
+    middle = slice(3, 11)
+    set_solution(graph, 0, identifiers[middle], wanted[0][middle], wanted[1][middle])
+    _, found, inverse = solved(graph)
+    assert torch.allclose(found[:, :3], wanted[0][:, :3], atol=1e-3) and np.allclose(inverse, wanted[1], rtol=1e-5)
+    assert not set_solution(graph, 7, identifiers[middle], wanted[0][middle], wanted[1][middle])
+
+
+def test_a_keyframe_that_a_solution_moves_alone_takes_its_dropped_ones_along():
+    graph = half_archived(dropped=(9,))
+    identifiers, poses_cw, depths = solved(graph)
+    row = identifiers.tolist().index(8)
+    alone = poses_cw[row : row + 1] + torch.tensor([0.5, 0, 0, 0, 0, 0, 0], dtype=torch.float64)
+    set_solution(graph, 0, identifiers[row : row + 1], alone, depths[row : row + 1])
+    _, found, _ = solved(graph)
+    kept = se3.relative(poses_cw[row], poses_cw[row + 1])
+    assert torch.allclose(se3.relative(found[row], found[row + 1])[:3], kept[:3], atol=1e-6)
+    assert torch.allclose(found[row, :3], alone[0, :3], atol=1e-6)
 
 
 @settings(max_examples=10, deadline=None)

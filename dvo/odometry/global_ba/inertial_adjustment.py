@@ -32,7 +32,7 @@ from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.inertial.factors import inertial_factors
 from dvo.odometry.inertial.preintegration import preintegrate
-from dvo.odometry.inertial.smoother import GRAVITY, Smoothed
+from dvo.odometry.inertial.smoother import GRAVITY, Smoothed, spaced
 
 MOST_FRAMES = 3000
 """Frames that are solved for at once; of more the kept keyframes alone, and of more of these none."""
@@ -107,7 +107,7 @@ def adjust_with_samples(
         The solution; None if samples do not cover two nodes, or nothing was found.
     """
     count = len(times)
-    nodes = _spaced(times, spacing)
+    nodes = np.array(spaced(times, [0] * count, spacing))
     stamps = times[nodes] + start.time_offset
     nodes = nodes[(stamps >= samples.timestamps[0]) & (stamps <= samples.timestamps[-1])]
     if len(nodes) < 3:
@@ -270,14 +270,3 @@ def _scale_deviation(problem: PatchProblem, options: GlobalBAOptions) -> float:
     gradient[slots[free], :3] = by[free]
     solved = replace(equations, g_p=gradient, g_l=torch.zeros_like(equations.g_l)).step(0.0, options.solver)[0][0]
     return float((gradient * solved).sum().sqrt())
-
-
-def _spaced(times: np.ndarray, spacing: float) -> np.ndarray:
-    """Positions of frames about ``spacing`` apart; those on either side of a gap, the first and the last among them."""
-    gap = np.diff(times) > 2 * spacing
-    edge = np.concatenate([[True], gap]) | np.concatenate([gap, [True]])
-    chosen: list[int] = []
-    for k, time in enumerate(times.tolist()):
-        if edge[k] or time - times[chosen[-1]] >= spacing - 1e-6:
-            chosen.append(k)
-    return np.array(chosen)

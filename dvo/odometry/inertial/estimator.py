@@ -70,6 +70,8 @@ NOISE_RANGE = (0.3, 30.0)
 MAX_FORCE_SIGMA = 0.025
 """Deviation of the acceleration, m/s^2, by bias and vertical together, above which samples hold a velocity no better
 than images do, and are no measurement for the window."""
+MAX_ADJUSTED_FORCE_SIGMA = 0.1
+"""The same, where the adjustment of images and samples brings window and map back to their unit every few seconds."""
 MAX_ROTATION_FACTOR = 8.0
 """Factor of the noise of visual orientations above which samples and images do not fit."""
 MAX_SHIFT = 0.02
@@ -88,6 +90,8 @@ MOST_PATIENCE = 2.0
 CLOSER = 0.5
 """Share of the deviation of the scale that an alignment needs, where the adjustment of images and samples tells it: the
 noise of the images is assumed there, and errors of the camera's calibration are not in it."""
+ADJUSTED_SIGMA = 0.75
+"""The same, of the deviation while the recording goes on, of two adjustments in a row."""
 _WAITING = ("too few poses", "too few samples")
 _UNCERTAIN = "the scale is uncertain"
 SURE_OFFSET, SURE_TURN = 3e-3, 0.5
@@ -192,6 +196,8 @@ class InertialEstimator:
         self.translation_camera_imu: Array = np.zeros(3)
         self.first_offset = 0.0  # time offset that the first estimate begins with, seconds
         self._candidate: tuple[float, float] | None = None  # log scale and its deviation, of an estimate that passed
+        self._unsure: tuple[Smoothed, VisualNodes, int] | None = None  # estimate whose scale is not sure, and its world
+        self._adjusted: tuple[float, float] | None = None  # log scale and its deviation, of an adjustment that passed
         self._failures, self._patience = 0, AT_FIRST
         self._next = self._whole = -np.inf  # times of the next estimate, and of the last one of the whole window
         self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
@@ -209,8 +215,14 @@ class InertialEstimator:
     @property
     def leads(self) -> bool:
         """True if samples tell the acceleration well enough to be a measurement for the window."""
+        most = MAX_FORCE_SIGMA if self._adjusted is None else MAX_ADJUSTED_FORCE_SIGMA
+        return self.aligned and self.force_sigma <= most
+
+    @property
+    def force_sigma(self) -> float:
+        """Deviation of the acceleration that samples tell, m/s^2; inf without an estimate."""
         s = self.solution
-        return self.aligned and s is not None and float(s.force_variance.mean()) <= MAX_FORCE_SIGMA**2
+        return np.inf if s is None else float(np.sqrt(s.force_variance.mean()))
 
     def add(self, samples: InertialSamples) -> None:
         """Take samples; the first with an extrinsic calibration and noise decide these.
@@ -259,6 +271,7 @@ class InertialEstimator:
         """
         if not len(nodes):
             return
+        self._unsure = None
         time = self._whole = float(nodes.times[-1])
         self._next = time + (EVERY if self.aligned else AT_FIRST)
         if self.solution is not None:  # the window begins with a node that is known
@@ -285,6 +298,8 @@ class InertialEstimator:
             return
         self._adapt(found, led=self.leads)
         reason = self._doubt(problem, found)
+        unsure = not reason or (reason.startswith(_UNCERTAIN) and found.scale_sigma <= LOST_SCALE)
+        self._unsure = (_from_first_camera(found), problem.nodes, worlds[-1]) if unsure and not self.aligned else None
         if not reason and worlds[-1] in self.worlds and found.scale_sigma > LOST_SCALE:
             reason = f"{_UNCERTAIN} by {100 * found.scale_sigma:.0f} %"
         if reason:
@@ -342,6 +357,62 @@ class InertialEstimator:
         scales = np.where(np.isin(s.segment, mine), s.log_scale - np.log(change.scale), s.log_scale)
         worlds = Similarities(logs, rotations, translations)
         self.solution = replace(s, log_scale=scales, worlds=worlds, past=None)
+        self._held = max(self._held, time)
+
+    def to_be_adjusted(self, world: int) -> tuple[Smoothed, VisualNodes | None] | None:
+        """Estimate that an adjustment of images and samples begins with, where it is of use.
+
+        Args:
+            world: number of the present world of the visual poses.
+
+        Returns:
+            An estimate whose scale is not sure, with its nodes; or that of an aligned world, None for the nodes, which
+            samples do not hold well enough. None where there is nothing to gain.
+        """
+        if not self.aligned:
+            return self._unsure[:2] if self._unsure is not None and self._unsure[2] == world else None
+        if self.solution is None or world not in self.worlds or self._known[-1:] != [world]:
+            return None
+        return (self.solution, None) if self.force_sigma > MAX_FORCE_SIGMA else None
+
+    def confirms(self, scale: float, scale_sigma: float) -> bool:
+        """Find out if the solution of an adjustment can be taken; an alignment needs two in a row that agree.
+
+        Args:
+            scale: metres in a unit of the newest visual poses.
+            scale_sigma: its relative deviation.
+        """
+        if self.aligned:
+            return scale_sigma <= self.options.max_scale_sigma
+        now = float(np.log(scale)), scale_sigma
+        before, self._adjusted = self._adjusted, now
+        if scale_sigma > ADJUSTED_SIGMA * self.options.max_scale_sigma:
+            self._adjusted = None
+            return False
+        return before is not None and abs(now[0] - before[0]) <= AGREEMENT + 3 * before[1]
+
+    def adopt(self, states: Smoothed, similarity: Similarity, world: int, scale_sigma: float) -> None:
+        """Go on from the solution of an adjustment, to which the visual poses have been corrected.
+
+        Args:
+            states: of the nodes, in the metric world.
+            similarity: from the world of visual poses to that.
+            world: number of the world of the visual poses.
+            scale_sigma: relative deviation of the scale.
+        """
+        log_scale = np.array([np.log(similarity.scale)])
+        known = Similarities(log_scale, similarity.rotation[None], similarity.translation[None])
+        time = float(states.times[-1])
+        self.solution = replace(states, log_scale=np.repeat(log_scale, len(states.times)), worlds=known, past=None)
+        self.worlds[world], self._known, self._failures = similarity, [world], 0
+        self._next = self._whole = -np.inf
+        if not self.aligned:
+            self.state, self.reason, self._aligned, self._offset = ScaleState.ALIGNED, "", time, states.time_offset
+            self._unsure, self._held = None, time
+            self.history.append({"time": time, "event": "aligned", "scale_sigma": scale_sigma})
+            state = self.last_state()
+            assert state is not None
+            self._past = [state]
         self._held = max(self._held, time)
 
     def last_state(self) -> BodyState | None:
@@ -871,6 +942,7 @@ class InertialEstimator:
             self.history.append({"time": time, "event": "withdrawn", "reason": reason})
             self.state, self.reason = ScaleState.INITIALISING, f"withdrawn: {reason}"
             self.worlds, self.solution, self._known, self._failures, self._past = {}, None, [], 0, []
+            self._unsure = self._adjusted = None
 
     def _accept(self, found: Smoothed, worlds: list[int], time: float) -> None:
         """Take an estimate that has passed; the first one has to be confirmed by another."""

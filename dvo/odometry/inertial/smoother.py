@@ -14,6 +14,7 @@ the camera turns. How noisy a visual trajectory is, its residuals tell (:attr:`S
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
 
@@ -84,6 +85,28 @@ class VisualNodes:
     def of(self, segment: int) -> VisualNodes:
         """Nodes of one segment, which becomes the only one."""
         return self.where(self.segment == segment)[0]
+
+
+def spaced(times: Array, worlds: Sequence[int], spacing: float) -> list[int]:
+    """Frames that become nodes: about ``spacing`` apart, those on either side of a break, and the last one.
+
+    The first frame of each interval of a fixed division of time: most are the same from estimate to estimate.
+
+    Args:
+        times: ``(N,)`` increasing, of frames, seconds.
+        worlds: ``(N,)`` number of the world of each.
+        spacing: seconds.
+
+    Returns:
+        Their positions, increasing.
+    """
+    chosen: list[int] = []
+    for k, time in enumerate(times.tolist()):
+        edge = k == len(times) - 1 or worlds[k + 1] != worlds[k] or times[k + 1] - time > 2 * spacing
+        begins = k == 0 or worlds[k - 1] != worlds[k] or time - times[k - 1] > 2 * spacing
+        if begins or edge or int(time / spacing + 1e-6) != int(times[k - 1] / spacing + 1e-6):
+            chosen.append(k)
+    return chosen
 
 
 @dataclass(frozen=True)

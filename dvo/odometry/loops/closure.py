@@ -243,6 +243,8 @@ class LoopCloser:
 
     def _search(self) -> Job[Loop | None] | None:
         """Search for a loop if it is time to."""
+        if self.maintenance.awaited:
+            return None
         kept, options = self.finder.kept, self.finder.options
         own = len(kept) > 2 * options.neighbours and kept[-1 - 2 * options.neighbours] >= self.graph.recording.keyframe
         if self.wait > 0 or not own:

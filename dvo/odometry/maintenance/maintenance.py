@@ -68,11 +68,13 @@ class MapMaintenance:
         real_time: take results as soon as they are there, instead of waiting for them at a fixed frame.
         steps: that a frame takes of a job in steps.
         job: in progress; None for none.
+        awaited: other work waits for the end of the job: no search begins.
     """
 
     real_time: bool = False
     steps: int = 1
     job: Job[Any] | None = None
+    awaited: bool = False
     _background: Background = field(default_factory=Background)
 
     @property

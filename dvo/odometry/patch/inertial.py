@@ -6,8 +6,8 @@ the frame at which scale and vertical are known for sure. At the end of a sequen
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,19 +18,18 @@ from dvo.core.errors import DvoError
 from dvo.data.inertial import InertialSamples, checked_samples
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
-from dvo.geometry.poses import matrix_to_quaternion, pose_from, quaternion_to_matrix, rotation_vector, slerp, split
+from dvo.geometry.poses import pose_from, rotation_vector, slerp, split
 from dvo.geometry.undistort import read_at_once
-from dvo.map.correction import Carried, Moved, apply_similarities, keyframes_of
+from dvo.map.correction import Carried, Moved, apply_similarities, keyframes_of, set_solution
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
+from dvo.map.map import Map
 from dvo.odometry.frames.gate import Admitted
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
-from dvo.odometry.global_ba.inertial_adjustment import MOST_FRAMES, VisualInertialSolution, adjust_with_samples
+from dvo.odometry.global_ba.inertial_adjustment import VisualInertialSolution
 from dvo.odometry.global_ba.rolling_shutter import Shutter, Turns
 from dvo.odometry.inertial.coupling import InertialCoupling
 from dvo.odometry.inertial.estimator import (
-    AGREEMENT,
-    MAX_ERROR,
     BodyState,
     InertialEstimator,
     Similarity,
@@ -38,8 +37,16 @@ from dvo.odometry.inertial.estimator import (
     camera_pose,
 )
 from dvo.odometry.inertial.options import InertialOptions
-from dvo.odometry.inertial.smoother import Smoothed, VisualNodes
+from dvo.odometry.inertial.smoother import Smoothed, VisualNodes, spaced
 from dvo.odometry.loops.closure import LoopCloser
+from dvo.odometry.maintenance.maintenance import MapMaintenance
+from dvo.odometry.patch.inertial_adjustments import (
+    InertialAdjustment,
+    MetricPath,
+    apply_solution,
+    metres_per_unit,
+    metric_path,
+)
 from dvo.odometry.protocol import Estimate, InertialEstimate, Result, ScaleState, Segment, Status
 
 GYRO_TRUST = 0.7
@@ -56,8 +63,13 @@ ANOTHER_CLOCK = 86400.0
 """Seconds between a sample and the newest frame that are no pause and no delay."""
 MOST_NODES = 400
 """Nodes of the estimate at the end of a sequence."""
-LEAST_EDGES = 12
-"""Measurements of a frame that takes part in the adjustment of images and samples."""
+ADJUST_EVERY, ADJUST_LATER, ADJUSTED = 1.0, 2.0, 10.0
+"""Seconds from one adjustment of images and samples beside tracking to the next, before the alignment and after it, and
+of frames that are solved for."""
+HARD = 0.05
+"""Deviation of the acceleration, m/s^2, above which they follow each other after the alignment as before it."""
+ADJUST_DELAY = 10
+"""Frames until its solution is taken."""
 SAME_TIME = 1e-6
 """Seconds."""
 
@@ -97,6 +109,7 @@ class InertialTracking:
         self._anchor: BodyState | None = None  # from which poses are predicted, while there are none by images
         self._state: BodyState | None = None  # the newest prediction
         self._way = 0.0  # metres since the alignment
+        self._last_adjusted = -np.inf  # time of the newest frame of the last adjustment beside tracking
 
     def turns(self, *, told: bool = False) -> Turns | None:
         """Rotations during the readout of a rolling shutter: none in the images of frames that were read at once.
@@ -278,8 +291,9 @@ class InertialTracking:
         def confirm(found: Smoothed) -> float:
             """Deviation of the scale by the adjustment of a world that is not in metres yet."""
             nonlocal adjusted
-            path = _path(found, nodes, np.ones(len(nodes), bool))
-            adjusted = self._adjusted(worlds[0], found, path, adjustment, shutter)
+            path = metric_path(found, nodes, np.ones(len(nodes), bool))
+            assert adjustment is not None
+            adjusted = self._adjustment(graph, worlds[0], found, path, adjustment, shutter).solve()
             return np.inf if adjusted is None else adjusted.scale_sigma
 
         closer = confirm if adjustment is not None and len(worlds) == 1 else None
@@ -292,8 +306,8 @@ class InertialTracking:
         for world, similarity in found.items():
             path = None
             if smoothed is not None and world in worlds:
-                path = _path(smoothed, nodes, np.array(worlds)[nodes.segment] == world)
-            units |= self._follow(world, _Path.constant(similarity) if path is None else path)
+                path = metric_path(smoothed, nodes, np.array(worlds)[nodes.segment] == world)
+            units |= self._follow(world, MetricPath.constant(similarity) if path is None else path)
         loops.moved(Moved(units))
         sigma = None if smoothed is None else smoothed.scale_sigma
         begun, entries = graph.recording.segment, []
@@ -305,12 +319,14 @@ class InertialTracking:
                 {"segment": world - begun, "source": "inertial", "factor": similarity.scale,
                  "deviation": sigma, "observations": len(nodes)}
             )  # fmt: skip
-        if smoothed is not None and found and adjusted is None:
-            adjusted = self._adjusted(min(found), smoothed, None, adjustment, shutter)
+        if smoothed is not None and found and adjusted is None and adjustment is not None:
+            adjusted = self._adjustment(graph, min(found), smoothed, None, adjustment, shutter).solve()
             adjusted = adjusted if adjusted and adjusted.scale_sigma <= self.options.max_scale_sigma else None
         information = estimator.information()
         if smoothed is not None and adjusted is not None:
-            loops.moved(Moved(self._place(adjusted)))
+            world = graph.world_of(graph.segment_of(int(adjusted.identifiers[0])))
+            solved = adjusted.identifiers.numpy(), adjusted.poses_cw, adjusted.depths.numpy()
+            loops.moved(set_solution(graph, world, *solved))
             estimator.solution = smoothed = adjusted.states
             information = estimator.information() | {"scale_sigma": adjusted.scale_sigma}
             for entry in entries:
@@ -320,66 +336,67 @@ class InertialTracking:
         scale = {"source": "inertial", "unit": "metres", "segments": entries}
         return {"inertial": information, **({"scale": scale} if entries else {})}
 
-    def _adjusted(
-        self, world: int, smoothed: Smoothed, path: _Path | None, options: AdjustmentOptions | None,
-        shutter: Shutter | None,
-    ) -> VisualInertialSolution | None:  # fmt: skip
-        """Solution of images and samples for a world.
+    def _adjustment(
+        self, graph: Map, world: int, start: Smoothed, path: MetricPath | None, options: AdjustmentOptions,
+        shutter: Shutter | None, since: float = -np.inf,
+    ) -> InertialAdjustment:  # fmt: skip
+        """Adjustment of images and samples of a world; see there."""
+        samples, estimator = self.estimator.stream.samples(), self.estimator
+        assert samples is not None
+        return InertialAdjustment(
+            graph, world, start, path, samples, estimator.noise, self.variance, self.options.interval, options, shutter,
+            since,
+        )  # fmt: skip
+
+    def adjust(self, maintenance: MapMaintenance, options: AdjustmentOptions, shutter: Shutter) -> None:
+        """Begin an adjustment of images and samples beside tracking, if one is due and no other work is in progress.
 
         Args:
-            world: its number.
-            smoothed: estimate to start from.
-            path: to metres; None for a world that is in metres.
+            maintenance: of the map.
             options: of the final adjustment.
             shutter: timing of the rows.
-
-        Returns:
-            None where there is none that agrees with both.
         """
-        graph, samples, estimator = self.graph, self.estimator.stream.samples(), self.estimator
-        if options is None or samples is None:
-            return None
-        frames = graph.members(world)
-        dropped = len(frames) <= MOST_FRAMES
-        frames = frames if dropped else [frame for frame in frames if frame.anchor is None]
-        times = np.array([frame.timestamp for frame in frames])
-        if not 3 <= len(frames) <= MOST_FRAMES or not (np.diff(times) > 0).all():
-            return None
-        part = graph.problem(dropped, world).with_values(factors=())
-        # Frames whose measurements have been released to save memory stay.
-        counts = torch.bincount(torch.cat([part.ii, part.jj]), minlength=len(frames))
-        linked = counts >= LEAST_EDGES
-        if int(linked.sum()) < 3:
-            return None
-        part, times = part.select(linked).planned(), times[linked.numpy()]
-        if path is not None:
-            moved, scales = path.moved(times, se3.inverse(part.poses_cw).numpy())
-            depths = part.inverse_depths.view(len(times), -1) / torch.from_numpy(scales)[:, None]
-            part = part.with_values(poses_cw=se3.inverse(torch.from_numpy(moved)), inverse_depths=depths.flatten())
-        found = adjust_with_samples(
-            part, times, smoothed, samples, estimator.noise, variance=self.variance, spacing=self.options.interval,
-            options=options, shutter=shutter,
-        )  # fmt: skip
-        # Where the two contradict each other, one of them is not what it seems.
-        if found is None or not found.inertial_error <= MAX_ERROR or not np.isfinite(found.scale_sigma):
-            return None
-        return found if abs(found.change) <= AGREEMENT + 3 * smoothed.scale_sigma else None
+        graph, window = self.graph, self.graph.window
+        maintenance.awaited = False
+        if not self.active or self.metric or self._anchor is not None or window.guests or not len(window):
+            return
+        if window.frames[-1].timestamp < self._last_adjusted + ADJUST_EVERY:
+            return
+        time, world, similarity = window.frames[-1].timestamp, graph.world_of(graph.segment), self._similarity()
+        start = self.estimator.to_be_adjusted(world)
+        if start is None:
+            return
+        if maintenance.job is not None:
+            maintenance.awaited = True
+            return
+        known, nodes = start
+        path = metric_path(known, nodes, np.ones(len(nodes), bool)) if nodes is not None else None
+        if nodes is None and similarity is not None:
+            path = MetricPath.constant(similarity)
+        if path is None:
+            return
+        soon = similarity is None or self.estimator.force_sigma > HARD
+        self._last_adjusted = time if soon else time + ADJUST_LATER - ADJUST_EVERY
+        rows = replace(shutter, readout=self.readout or shutter.readout, turns=self.turns())
+        snapshot = graph.copy()
+        snapshot.archive_window()
+        work = self._adjustment(snapshot, world, known, path, options, rows, time - ADJUSTED)
+        begun = _Begun(graph.segment, world, similarity is not None)
+        maintenance.job = maintenance.beside("adjustment", work.solve, partial(self._apply, begun), ADJUST_DELAY)
 
-    def _place(self, adjusted: VisualInertialSolution) -> dict[int, float]:
-        """Move the keyframes of a solution, and what is relative to them; the new unit of each, in old ones."""
-        graph, identifiers = self.graph, adjusted.identifiers.tolist()
-        before = [graph.archive[k] for k in identifiers]
-        kept = np.array([frame.anchor is None for frame in before])
-        changes = [float(np.median(d / f.inverse_depth)) for d, f in zip(adjusted.depths.numpy(), before, strict=True)]
-        scales = torch.tensor(changes, dtype=torch.float64)[kept, None]
-        poses = adjusted.poses_cw[kept]
-        similarities = torch.cat([poses[:, :3] * scales, poses[:, 3:], scales], 1)
-        apply_similarities(graph, adjusted.identifiers.numpy()[kept], similarities)
-        for identifier, pose_cw, depths in zip(
-            identifiers, adjusted.poses_cw.numpy(), adjusted.depths.numpy(), strict=True
-        ):
-            graph.correct(identifier, pose_cw, depths)
-        return {k: change for k, change, own in zip(identifiers, changes, kept, strict=True) if own}
+    def _apply(self, begun: _Begun, solution: VisualInertialSolution | None) -> Moved:
+        """Take the solution of an adjustment beside tracking; what has moved."""
+        graph, estimator, similarity = self.graph, self.estimator, self._similarity()
+        now = _Begun(graph.segment, graph.world_of(graph.segment), similarity is not None)
+        if solution is None or now != begun or self._anchor is not None or not len(graph.window):
+            return Moved({})
+        if not estimator.confirms(metres_per_unit(graph, solution), solution.scale_sigma):
+            return Moved({})
+        applied = apply_solution(graph, begun.world, solution, similarity)
+        estimator.adopt(applied.states, applied.similarity, begun.world, solution.scale_sigma)
+        for carried in applied.moved.worlds:
+            self._carry(carried)
+        return Moved(applied.moved.units)
 
     def corrected(self, carried: Carried) -> None:
         """Follow a correction of the map, after which each segment is in the world that it belongs to.
@@ -387,16 +404,21 @@ class InertialTracking:
         Args:
             carried: how the newest poses of a world have moved.
         """
+        by = self._carry(carried)
+        if not self.metric and self.estimator.aligned:
+            self.estimator.corrected(carried.world, self.graph.world_of(carried.world), by, carried.time)
+
+    def _carry(self, carried: Carried) -> Similarity:
+        """Move the newest poses along with the window; the change."""
         rotation, translation = split(carried.change[:7].numpy())
         by = Similarity(float(carried.change[7]), rotation, translation)
         if carried.window:
             self._last, self._before = (
                 None if known is None else (known[0], _changed(known[1], by)) for known in (self._last, self._before)
             )
-        if not self.metric and self.estimator.aligned:
-            self.estimator.corrected(carried.world, self.graph.world_of(carried.world), by, carried.time)
+        return by
 
-    def _follow(self, world: int, path: _Path) -> dict[int, float]:
+    def _follow(self, world: int, path: MetricPath) -> dict[int, float]:
         """Move the kept keyframes of a world; the scale of the similarity of each."""
         graph = self.graph
         identifiers = keyframes_of(graph, world)
@@ -457,7 +479,7 @@ class InertialTracking:
         spacing = self.options.interval
         if np.isneginf(since) and len(times):
             spacing = max(spacing, (times[-1] - times[0]) / MOST_NODES)
-        chosen = _spaced(times, world_of, spacing)
+        chosen = spaced(times, world_of, spacing)
         chosen_of = np.array([world_of[k] for k in chosen], int)
         begins = np.diff(chosen_of, prepend=-1) != 0  # a world comes again where a segment was found in it
         segment, worlds = np.cumsum(begins) - 1, chosen_of[begins].tolist()
@@ -586,48 +608,12 @@ class InertialTracking:
 
 
 @dataclass(frozen=True)
-class _Path:
-    """Similarities from the world of visual poses to the metric one, that change over time."""
+class _Begun:
+    """What has to be the same when the solution of an adjustment is taken."""
 
-    times: np.ndarray
-    log_scale: np.ndarray
-    rotation: np.ndarray  # (N, 4) quaternions
-    translation: np.ndarray
-
-    @classmethod
-    def constant(cls, similarity: Similarity) -> _Path:
-        quaternion = pose_from(similarity.rotation, np.zeros(3))[3:]
-        return cls(np.zeros(1), np.log([similarity.scale]), quaternion[None], similarity.translation[None])
-
-    def moved(self, times: np.ndarray, poses_wc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses ``(K, 7)`` at times between the nodes, in metres, and the scale of each."""
-        after = np.searchsorted(self.times, times).clip(0, len(self.times) - 1)
-        before = (after - 1).clip(0)
-        span = np.maximum(self.times[after] - self.times[before], 1e-9)
-        share = np.clip((times - self.times[before]) / span, 0, 1)
-        scale = np.exp((1 - share) * self.log_scale[before] + share * self.log_scale[after])
-        turn = slerp(self.rotation[before], self.rotation[after], share)
-        rotation, position = split(poses_wc)
-
-        def placed(k: np.ndarray) -> np.ndarray:
-            turned = (quaternion_to_matrix(self.rotation[k]) @ position[..., None])[..., 0]
-            return np.exp(self.log_scale[k])[:, None] * turned + self.translation[k]
-
-        where = (1 - share)[:, None] * placed(before) + share[:, None] * placed(after)
-        return pose_from(quaternion_to_matrix(turn) @ rotation, where), scale
-
-
-def _path(smoothed: Smoothed, nodes: VisualNodes, mine: np.ndarray) -> _Path | None:
-    """Similarity at each node of a segment; None without nodes."""
-    shared = np.flatnonzero(np.isin(np.round(nodes.times, 6), np.round(smoothed.times, 6)) & mine)
-    if not len(shared):
-        return None
-    at = np.searchsorted(smoothed.times, nodes.times[shared] - 1e-6)
-    rotation = smoothed.rotation[at] @ np.swapaxes(nodes.rotation[shared] @ smoothed.rotation_camera_imu, -1, -2)
-    camera = smoothed.position[at] + smoothed.rotation[at] @ smoothed.lever
-    scale = np.exp(smoothed.log_scale[at])[:, None]
-    translation = camera - scale * (rotation @ nodes.position[shared][..., None])[..., 0]
-    return _Path(nodes.times[shared], smoothed.log_scale[at], matrix_to_quaternion(rotation), translation)
+    segment: int
+    world: int
+    aligned: bool
 
 
 def _turns_of(at_once: np.ndarray, told: Turns | None) -> Turns:
@@ -639,20 +625,6 @@ def _turns_of(at_once: np.ndarray, told: Turns | None) -> Turns:
         return np.where((np.abs(at_once[at] - times) <= SAME_TIME)[:, None, None], 0.0, found)
 
     return turns
-
-
-def _spaced(times: np.ndarray, worlds: Sequence[int], spacing: float) -> list[int]:
-    """Positions of frames about ``spacing`` apart; those on either side of a break and the last one among them.
-
-    The first frame of each interval of a fixed division of time: most are the same from estimate to estimate.
-    """
-    chosen: list[int] = []
-    for k, time in enumerate(times.tolist()):
-        edge = k == len(times) - 1 or worlds[k + 1] != worlds[k] or times[k + 1] - time > 2 * spacing
-        begins = k == 0 or worlds[k - 1] != worlds[k] or time - times[k - 1] > 2 * spacing
-        if begins or edge or int(time / spacing + 1e-6) != int(times[k - 1] / spacing + 1e-6):
-            chosen.append(k)
-    return chosen
 
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int]]:

@@ -200,7 +200,10 @@ class PatchOdometry:
         if not self.inertial.active:
             return estimate
         moved = not admitted.repeated and (self.aligner is None or self.aligner.age == 0)
-        return self.inertial.express(record, estimate, moved=moved)
+        expressed = self.inertial.express(record, estimate, moved=moved)
+        if moved and state.initialised and self.config.final_adjustment:
+            self.inertial.adjust(self.loops.maintenance, self.config.adjustment, state.shutter)
+        return expressed
 
     def _remember(self, admitted: Admitted) -> None:
         """Keep a frame at the beginning of a recording; with other sensors, and in real time, none begins anew."""

@@ -21,8 +21,8 @@ from dvo.geometry.poses import rotation_vector, so3_exp, split
 from dvo.odometry.global_ba.graph_adjustment import Adjusted
 from dvo.odometry.global_ba.inertial_adjustment import VisualInertialSolution as Solution
 from dvo.odometry.inertial.estimator import Similarity
-from dvo.odometry.inertial.smoother import GRAVITY, Similarities, Smoothed
-from dvo.odometry.patch.inertial import _led, _runs, _spaced, _turns_of
+from dvo.odometry.inertial.smoother import GRAVITY, Similarities, Smoothed, spaced
+from dvo.odometry.patch.inertial import _led, _runs, _turns_of
 from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Estimate, ScaleState, Status
 from tests.support.tiny_tracker import SMALL, frames, plain, tracker
@@ -333,7 +333,7 @@ def test_samples_that_do_not_meet_the_images_are_told() -> None:
 
 def test_nodes_stand_on_either_side_of_a_break() -> None:
     times = np.concatenate([np.arange(0, 1, 0.05), np.arange(2, 2.5, 0.05)])
-    chosen = times[_spaced(times, [0] * len(times), 0.2)]
+    chosen = times[spaced(times, [0] * len(times), 0.2)]
     assert {0.0, 2.0} <= set(chosen.tolist())
     assert any(np.isclose(chosen, 0.95)) and np.isclose(chosen[-1], times[-1])
     assert _runs(np.array([False, True, True, False, True])) == [(1, 3), (4, 5)]

@@ -36,9 +36,9 @@ from dvo.odometry.inertial.smoother import GRAVITY, Smoothed, spaced
 
 MOST_FRAMES = 3000
 """Frames that are solved for at once; of more the kept keyframes alone, and of more of these none."""
-ROUNDS, ITERATIONS, TOLERANCE, SAME = 3, 12, 1e-5, 1e-4
+ROUNDS, ITERATIONS, TOLERANCE, SAME = 3, 12, 1e-5, 10
 """Solutions, each with samples integrated with the biases of the one before and rows corrected for its motion; steps
-of each at most, relative decrease of the cost at which it ends, and from one solution to the next at which all do."""
+of each at most, relative decrease of the cost at which it ends, and times that from one to the next at which all do."""
 DAMPING = 1e-13
 """At the start. Images hold each pose so much better than samples hold the size of all together that a usual damping,
 a fraction of the diagonal, would hold that."""
@@ -89,6 +89,7 @@ def adjust_with_samples(
     spacing: float,
     options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008 (frozen)
     shutter: Shutter | None = None,
+    tolerance: float = TOLERANCE,
 ) -> VisualInertialSolution | None:
     """Solve for a world by its images and samples.
 
@@ -102,6 +103,7 @@ def adjust_with_samples(
         spacing: of the nodes, seconds.
         options: of the final adjustment: its last kernel, and the longest residual.
         shutter: timing of the rows; None for a global shutter.
+        tolerance: relative decrease of the cost at which a solution ends.
 
     Returns:
         The solution; None if samples do not cover two nodes, or nothing was found.
@@ -116,7 +118,7 @@ def adjust_with_samples(
     fixed = torch.arange(count) == 0
     settings = GlobalBAOptions(
         fixed, options.kernels[-1], options.max_residual, depth_range=DEPTHS,
-        solver=LMOptions(max_iterations=ITERATIONS, tolerance=TOLERANCE, damping=DAMPING),
+        solver=LMOptions(max_iterations=ITERATIONS, tolerance=tolerance, damping=DAMPING),
     )  # fmt: skip
     sigma = float(np.sqrt(VISUAL * variance))
     extrinsics = pose_from(start.rotation_camera_imu, -start.rotation_camera_imu @ start.lever)
@@ -137,7 +139,7 @@ def adjust_with_samples(
         found = solve(problem, settings)
         poses, depths = se3.normalise(found.poses_cw), found.patches[:, 2, 0, 0].view(count, -1)
         states = states.after(found)
-        if abs(before - found.cost) <= SAME * before:
+        if abs(before - found.cost) <= SAME * tolerance * before:
             break
         before = found.cost
     assert found is not None

@@ -63,13 +63,13 @@ ANOTHER_CLOCK = 86400.0
 """Seconds between a sample and the newest frame that are no pause and no delay."""
 MOST_NODES = 400
 """Nodes of the estimate at the end of a sequence."""
-ADJUST_EVERY, ADJUST_LATER, ADJUSTED = 1.0, 2.0, 10.0
+ADJUST_EVERY, ADJUST_LATER, ADJUSTED = 1.0, 3.0, 10.0
 """Seconds from one adjustment of images and samples beside tracking to the next, before the alignment and after it, and
 of frames that are solved for."""
 HARD = 0.05
 """Deviation of the acceleration, m/s^2, above which they follow each other after the alignment as before it."""
-ADJUST_DELAY = 10
-"""Frames until its solution is taken."""
+ADJUST_DELAY, ADJUST_TOLERANCE = 10, 1e-3
+"""Frames until its solution is taken, and its tolerance: with 1e-5 the scale differs by less than .1 %."""
 SAME_TIME = 1e-6
 """Seconds."""
 
@@ -338,14 +338,13 @@ class InertialTracking:
 
     def _adjustment(
         self, graph: Map, world: int, start: Smoothed, path: MetricPath | None, options: AdjustmentOptions,
-        shutter: Shutter | None, since: float = -np.inf,
+        shutter: Shutter | None,
     ) -> InertialAdjustment:  # fmt: skip
         """Adjustment of images and samples of a world; see there."""
         samples, estimator = self.estimator.stream.samples(), self.estimator
         assert samples is not None
         return InertialAdjustment(
             graph, world, start, path, samples, estimator.noise, self.variance, self.options.interval, options, shutter,
-            since,
         )  # fmt: skip
 
     def adjust(self, maintenance: MapMaintenance, options: AdjustmentOptions, shutter: Shutter) -> None:
@@ -379,8 +378,10 @@ class InertialTracking:
         self._last_adjusted = time if soon else time + ADJUST_LATER - ADJUST_EVERY
         rows = replace(shutter, readout=self.readout or shutter.readout, turns=self.turns())
         snapshot = graph.copy()
+        snapshot.archive.config = replace(snapshot.archive.config, features=False, images=False)
         snapshot.archive_window()
-        work = self._adjustment(snapshot, world, known, path, options, rows, time - ADJUSTED)
+        work = self._adjustment(snapshot, world, known, path, options, rows)
+        work = replace(work, since=time - ADJUSTED, tolerance=ADJUST_TOLERANCE)
         begun = _Begun(graph.segment, world, similarity is not None)
         maintenance.job = maintenance.beside("adjustment", work.solve, partial(self._apply, begun), ADJUST_DELAY)
 

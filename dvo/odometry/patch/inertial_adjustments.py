@@ -20,7 +20,12 @@ from dvo.map.correction import Moved, set_solution
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.map import Map
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
-from dvo.odometry.global_ba.inertial_adjustment import MOST_FRAMES, VisualInertialSolution, adjust_with_samples
+from dvo.odometry.global_ba.inertial_adjustment import (
+    MOST_FRAMES,
+    TOLERANCE,
+    VisualInertialSolution,
+    adjust_with_samples,
+)
 from dvo.odometry.global_ba.rolling_shutter import Shutter
 from dvo.odometry.inertial.estimator import AGREEMENT, MAX_ERROR, Similarity
 from dvo.odometry.inertial.smoother import Smoothed, VisualNodes
@@ -97,6 +102,7 @@ class InertialAdjustment:
         options: of the final adjustment.
         shutter: timing of the rows; None for a global shutter.
         since: time of the first frame that is solved for, seconds.
+        tolerance: see :func:`adjust_with_samples`.
     """
 
     graph: Map
@@ -110,6 +116,7 @@ class InertialAdjustment:
     options: AdjustmentOptions
     shutter: Shutter | None = None
     since: float = -np.inf
+    tolerance: float = TOLERANCE
 
     def solve(self) -> VisualInertialSolution | None:
         """Solution; None where there is none that agrees with both."""
@@ -135,7 +142,7 @@ class InertialAdjustment:
             part = part.with_values(poses_cw=se3.inverse(torch.from_numpy(moved)), inverse_depths=depths.flatten())
         found = adjust_with_samples(
             part, times, self.start, self.samples, self.noise, variance=self.variance, spacing=self.spacing,
-            options=self.options, shutter=self.shutter,
+            options=self.options, shutter=self.shutter, tolerance=self.tolerance,
         )  # fmt: skip
         # Where the two contradict each other, one of them is not what it seems.
         if found is None or not found.inertial_error <= MAX_ERROR or not np.isfinite(found.scale_sigma):

@@ -197,7 +197,7 @@ class InertialEstimator:
         self.first_offset = 0.0  # time offset that the first estimate begins with, seconds
         self._candidate: tuple[float, float] | None = None  # log scale and its deviation, of an estimate that passed
         self._unsure: tuple[Smoothed, VisualNodes, int] | None = None  # estimate whose scale is not sure, and its world
-        self._adjusted: tuple[float, float] | None = None  # log scale and its deviation, of an adjustment that passed
+        self._adjusted: tuple[float, float] | None = None  # the same of an adjustment of images and samples
         self._failures, self._patience = 0, AT_FIRST
         self._next = self._whole = -np.inf  # times of the next estimate, and of the last one of the whole window
         self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
@@ -406,6 +406,7 @@ class InertialEstimator:
         self.solution = replace(states, log_scale=np.repeat(log_scale, len(states.times)), worlds=known, past=None)
         self.worlds[world], self._known, self._failures = similarity, [world], 0
         self._next = self._whole = -np.inf
+        self._adjusted = float(log_scale[0]), scale_sigma
         if not self.aligned:
             self.state, self.reason, self._aligned, self._offset = ScaleState.ALIGNED, "", time, states.time_offset
             self._unsure, self._held = None, time

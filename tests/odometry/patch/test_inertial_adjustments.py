@@ -9,18 +9,20 @@ import numpy as np
 import pytest
 import torch
 
+from dvo.data.inertial import NOISE_PRESETS, InertialSamples
 from dvo.geometry import se3
-from dvo.geometry.poses import pose_from, so3_exp, split
+from dvo.geometry.poses import pose_from, rotation_vector, so3_exp, split
 from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.global_ba.inertial_adjustment import VisualInertialSolution
 from dvo.odometry.inertial.estimator import Similarity
-from dvo.odometry.inertial.smoother import Similarities, Smoothed, VisualNodes
+from dvo.odometry.inertial.smoother import GRAVITY, Similarities, Smoothed, VisualNodes
 from dvo.odometry.patch.inertial import ADJUST_DELAY, ADJUST_EVERY, _Begun
-from dvo.odometry.patch.inertial_adjustments import InertialAdjustment, apply_solution, metres_per_unit
+from dvo.odometry.patch.inertial_adjustments import InertialAdjustment, MetricPath, apply_solution, metres_per_unit
 from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import ScaleState
-from tests.odometry.patch.test_inertial import UPRIGHT, with_samples
-from tests.support.archived_walk import archived_walk
+from tests.odometry.patch.test_inertial import IDENTITY, UPRIGHT, with_samples
+from tests.support.archived_walk import archived_walk, pose_at
 from tests.support.tiny_tracker import frames, tracker
 
 KNOWN = Similarity(2.0, so3_exp(np.array([-1.2, 0.3, 0.4])), np.array([3.0, -1.0, 0.5]))
@@ -149,3 +151,41 @@ def test_a_solution_of_another_world_is_not_taken() -> None:
     assert torch.equal(odometry.window.poses_cw, before)
     assert tracking._apply(_Begun(0, 0, False), replace(solution, scale_sigma=0.01))
     assert tracking.estimator.aligned
+
+
+def recorded(scale: float, until: float) -> InertialSamples:
+    """Samples of a sensor in the camera of the walk, whose unit is so many metres long, 200 a second."""
+    times, step = np.arange(-0.2, until + 0.2, 0.005), 1e-3
+
+    def moved(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rotation, position = split(se3.inverse(pose_at(torch.from_numpy(t))).numpy())
+        return UPRIGHT @ rotation, scale * position @ UPRIGHT.T
+
+    (rotation, position), before, after = moved(times), moved(times - step), moved(times + step)
+    acceleration = (before[1] - 2 * position + after[1]) / step**2
+    turned = rotation_vector(np.swapaxes(before[0], -1, -2) @ after[0]) / (2 * step)
+    forces = np.einsum("nji,nj->ni", rotation, acceleration - GRAVITY)
+    return InertialSamples(times, turned, forces, IDENTITY, NOISE_PRESETS["euroc"])
+
+
+@pytest.mark.parametrize("since", [-np.inf, 1.95])
+def test_the_adjustment_of_a_part_of_the_map_finds_its_motion_in_metres(since: float) -> None:
+    """The unit of the visual poses drifts by half over the walk, and the start takes it as 1.8 m for 2 m."""
+    graph, truth = archived_walk(frames=40, dropped=(7, 20))
+    similarity = Similarity(1.8 / 1.25, UPRIGHT, np.zeros(3))
+    times = truth.timestamps
+    poses_wc = pose_from(UPRIGHT @ split(truth.poses_wc)[0], similarity.points(split(truth.poses_wc)[1]))
+    start = replace(states_at(times, poses_wc), velocity=np.gradient(poses_wc[:, :3], times, axis=0))
+    work = InertialAdjustment(
+        graph, 0, start, MetricPath.constant(similarity), recorded(2.0, times[-1]), NOISE_PRESETS["euroc"], 1e-4, 0.2,
+        AdjustmentOptions(), since=since,
+    )  # fmt: skip
+    found = work.solve()
+    assert found is not None
+    wanted = times >= since
+    assert found.identifiers.tolist() == np.flatnonzero(wanted).tolist()
+    positions, true = solution_positions(found), 2.0 * split(truth.poses_wc)[1][wanted]
+    lengths = [np.linalg.norm(p[5:] - p[:-5], axis=1) for p in (positions, true)]
+    assert np.allclose(*lengths, rtol=0.01) and found.scale_sigma < 0.02
+    up = split(se3.inverse(found.poses_cw).numpy())[0][:, 2]
+    assert np.allclose(up, (UPRIGHT @ split(truth.poses_wc)[0][wanted])[:, 2], atol=5e-3)

@@ -52,8 +52,9 @@ ROUNDS, FINAL_ITERATIONS = 3, 25
 """Estimates at the end of a recording, and Gauss-Newton steps of each."""
 MAX_GRAVITY_SIGMA = 1.5
 """Standard deviation of the vertical that an alignment needs, degrees."""
-LOST_SCALE = 0.2
-"""Relative deviation of the scale of a world that was aligned above which it is not known any more."""
+LOST_SCALE, UNSURE_SCALE = 0.2, 0.1
+"""Relative deviation of the scale of a world that was aligned above which it is not known any more, and up to which the
+adjustment of images and samples is asked for one that was not; and above which an estimate does not replace another."""
 NOTHING_TOLD = 0.5
 """Relative deviation of the scale above which the motion tells nothing of it."""
 MAX_ERROR = 6.0
@@ -304,6 +305,8 @@ class InertialEstimator:
             reason = f"{_UNCERTAIN} by {100 * found.scale_sigma:.0f} %"
         if reason:
             self._refuse(reason, time)
+            return
+        if worlds[-1] in self.worlds and found.scale_sigma > UNSURE_SCALE:
             return
         self._held = float(found.times[problem.held])
         self._accept(found, worlds, time)

@@ -11,7 +11,16 @@ from dvo.data.inertial import InertialSamples
 from dvo.geometry.poses import rotation_vector, so3_exp
 from dvo.odometry.inertial.estimator import BodyState, InertialEstimator, Similarity
 from dvo.odometry.inertial.options import InertialOptions
-from dvo.odometry.inertial.smoother import GRAVITY, Similarities, VisualNodes, first_values, smooth, upright
+from dvo.odometry.inertial.smoother import (
+    GRAVITY,
+    Similarities,
+    Smoothed,
+    Smoother,
+    VisualNodes,
+    first_values,
+    smooth,
+    upright,
+)
 from dvo.odometry.inertial.stream import SampleStream
 from dvo.odometry.protocol import ScaleState
 from tests.support.visual_inertial import CAMERA_IMU, LEVER, OFFSET, SCALE, Recording, record
@@ -598,3 +607,45 @@ def test_a_clock_that_drifts_is_told_within_seconds_and_for_good(rate: float, is
     nodes = recording.nodes(0.0, 14.0)
     assert (estimator.settle(nodes, [0]) is not None) == is_used
     assert estimator.aligned == is_used
+
+
+@pytest.mark.parametrize(("sigma", "taken", "failures"), [(0.05, True, 0), (0.15, False, 0), (0.25, False, 1)])
+def test_an_estimate_with_an_unsure_scale_does_not_replace_the_one_before(
+    monkeypatch: pytest.MonkeyPatch, sigma: float, taken: bool, failures: int
+) -> None:
+    recording = record(0, seconds=8.0)
+    estimator = drive(recording, until=6.0)[0]
+    before, solved = estimator.solution, estimator._solved
+    assert estimator.aligned
+
+    def unsure(problem: Smoother, worlds: list[int]) -> Smoothed | None:
+        found = solved(problem, worlds)
+        assert found is not None
+        covariance = found.covariance.copy()
+        covariance[-4, -4] += sigma**2 - found.scale_sigma**2
+        return replace(found, covariance=covariance)
+
+    monkeypatch.setattr(estimator, "_solved", unsure)
+    estimator.add(recording.samples.between(estimator.stream.end, 7.0))
+    estimator.update(recording.nodes(0.0, 7.0), [0])
+    assert (estimator.solution is not before) == taken and estimator._failures == failures and estimator.aligned
+
+
+def test_two_adjustments_that_agree_align_and_samples_then_lead_the_window() -> None:
+    recording = record(0, seconds=8.0)
+    estimator = drive(recording, until=6.0)[0]
+    solution, similarity = estimator.solution, estimator.worlds[0]
+    assert solution is not None and estimator.leads and estimator.to_be_adjusted(0) is None
+    noisy = solution.covariance.copy()
+    noisy[range(12, 15), range(12, 15)] += 0.05**2  # of the accelerometer's bias
+    estimator.solution = solution = replace(solution, covariance=noisy)
+    assert not estimator.leads and estimator.to_be_adjusted(1) is None
+    assert (start := estimator.to_be_adjusted(0)) is not None and start[0] is solution and start[1] is None
+    fresh = InertialEstimator(InertialOptions())
+    fresh.add(recording.samples.between(-np.inf, 6.0))
+    assert fresh.to_be_adjusted(0) is None
+    assert not fresh.confirms(2.0, 0.02) and not fresh.confirms(2.5, 0.02) and not fresh.confirms(2.5, 0.05)
+    assert not fresh.confirms(2.0, 0.02) and fresh.confirms(2.05, 0.02)
+    fresh.adopt(solution, similarity, 0, 0.02)
+    assert fresh.aligned and fresh.worlds == {0: similarity}
+    assert fresh.leads and 0.04 < fresh.force_sigma < 0.1 and fresh.history[-1]["scale_sigma"] == 0.02

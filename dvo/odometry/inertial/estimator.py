@@ -91,6 +91,8 @@ MOST_PATIENCE = 2.0
 CLOSER = 0.5
 """Share of the deviation of the scale that an alignment needs, where the adjustment of images and samples tells it: the
 noise of the images is assumed there, and errors of the camera's calibration are not in it."""
+PATIENT = 1.5
+"""Seconds for which the estimate has been unsure before the adjustment is asked: samples of a good sensor need none."""
 ADJUSTED_SIGMA = 0.75
 """The same, of the deviation while the recording goes on, of two adjustments in a row."""
 _WAITING = ("too few poses", "too few samples")
@@ -198,6 +200,7 @@ class InertialEstimator:
         self.first_offset = 0.0  # time offset that the first estimate begins with, seconds
         self._candidate: tuple[float, float] | None = None  # log scale and its deviation, of an estimate that passed
         self._unsure: tuple[Smoothed, VisualNodes, int] | None = None  # estimate whose scale is not sure, and its world
+        self._unsure_since = np.inf  # time of the first of them
         self._adjusted: tuple[float, float] | None = None  # the same of an adjustment of images and samples
         self._failures, self._patience = 0, AT_FIRST
         self._next = self._whole = -np.inf  # times of the next estimate, and of the last one of the whole window
@@ -300,7 +303,9 @@ class InertialEstimator:
         self._adapt(found, led=self.leads)
         reason = self._doubt(problem, found)
         unsure = not reason or (reason.startswith(_UNCERTAIN) and found.scale_sigma <= LOST_SCALE)
-        self._unsure = (_from_first_camera(found), problem.nodes, worlds[-1]) if unsure and not self.aligned else None
+        if unsure and not self.aligned:
+            self._unsure = _from_first_camera(found), problem.nodes, worlds[-1]
+            self._unsure_since = min(self._unsure_since, time)
         if not reason and worlds[-1] in self.worlds and found.scale_sigma > LOST_SCALE:
             reason = f"{_UNCERTAIN} by {100 * found.scale_sigma:.0f} %"
         if reason:
@@ -373,7 +378,8 @@ class InertialEstimator:
             samples do not hold well enough. None where there is nothing to gain.
         """
         if not self.aligned:
-            return self._unsure[:2] if self._unsure is not None and self._unsure[2] == world else None
+            waited = self._whole - self._unsure_since >= PATIENT
+            return self._unsure[:2] if waited and self._unsure is not None and self._unsure[2] == world else None
         if self.solution is None or world not in self.worlds or self._known[-1:] != [world]:
             return None
         return (self.solution, None) if self.force_sigma > MAX_FORCE_SIGMA else None

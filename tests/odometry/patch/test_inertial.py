@@ -202,7 +202,7 @@ def test_at_the_end_images_and_samples_decide_together(
 
     results = []
     for stub in (lambda *_, **__: None, solved):
-        monkeypatch.setattr("dvo.odometry.patch.inertial.adjust_with_samples", stub)
+        monkeypatch.setattr("dvo.odometry.patch.inertial_adjustments.adjust_with_samples", stub)
         odometry = tracker()
         for k, frame in enumerate(with_samples(frames(14))):
             odometry.track(replace(frame, camera=replace(frame.camera, readout=0.01)))
@@ -222,7 +222,7 @@ def test_at_the_end_images_and_samples_decide_together(
 
 @pytest.mark.long
 def test_without_a_final_adjustment_there_is_none_with_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dvo.odometry.patch.inertial.adjust_with_samples", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("dvo.odometry.patch.inertial_adjustments.adjust_with_samples", lambda *_, **__: 1 / 0)
     odometry = tracker(replace(SMALL, final_adjustment=False))
     for k, frame in enumerate(with_samples(frames(14))):
         odometry.track(frame)

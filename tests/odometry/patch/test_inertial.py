@@ -15,33 +15,19 @@ from hypothesis import strategies as st
 from dvo.ba.patch_problem import PatchProblem
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
-from dvo.data.inertial import ImuNoise, InertialSamples
 from dvo.geometry import se3, sim3
-from dvo.geometry.poses import rotation_vector, so3_exp, split
+from dvo.geometry.poses import rotation_vector, split
 from dvo.odometry.global_ba.graph_adjustment import Adjusted
 from dvo.odometry.global_ba.inertial_adjustment import VisualInertialSolution as Solution
 from dvo.odometry.inertial.estimator import Similarity
-from dvo.odometry.inertial.smoother import GRAVITY, Similarities, Smoothed, spaced
+from dvo.odometry.inertial.smoother import Similarities, Smoothed, spaced
 from dvo.odometry.patch.inertial import _led, _runs, _turns_of
 from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Estimate, ScaleState, Status
+from tests.support.steady_samples import IDENTITY, UPRIGHT, with_samples
 from tests.support.tiny_tracker import SMALL, frames, plain, tracker
 
-UPRIGHT = so3_exp(np.array([-np.pi / 2, 0.0, 0.0]))  # y down to z up
 SPEED = np.array([0.4, 0.0, 0.0])
-IDENTITY = np.array([0.0, 0, 0, 0, 0, 0, 1])
-
-
-def with_samples(images: list[Frame]) -> list[Frame]:
-    """Frames with samples of a sensor that moves at constant speed, upright."""
-    out, before = [], images[0].timestamp - 0.1
-    for frame in images:
-        times = np.arange(before + 0.005, frame.timestamp + 1e-9, 0.005)
-        forces = np.tile(-UPRIGHT.T @ GRAVITY, (len(times), 1))
-        samples = InertialSamples(times, np.zeros((len(times), 3)), forces, IDENTITY, ImuNoise())
-        out.append(replace(frame, inertial=samples))
-        before = float(times[-1])
-    return out
 
 
 def align(odometry: PatchOdometry, time: float) -> None:

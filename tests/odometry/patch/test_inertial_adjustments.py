@@ -21,8 +21,8 @@ from dvo.odometry.patch.inertial import ADJUST_DELAY, ADJUST_EVERY, _Begun
 from dvo.odometry.patch.inertial_adjustments import InertialAdjustment, MetricPath, apply_solution, metres_per_unit
 from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import ScaleState
-from tests.odometry.patch.test_inertial import IDENTITY, UPRIGHT, with_samples
 from tests.support.archived_walk import archived_walk, pose_at
+from tests.support.steady_samples import IDENTITY, UPRIGHT, with_samples
 from tests.support.tiny_tracker import frames, tracker
 
 KNOWN = Similarity(2.0, so3_exp(np.array([-1.2, 0.3, 0.4])), np.array([3.0, -1.0, 0.5]))

@@ -121,8 +121,12 @@ def _on_one_body(bodies: dict[str, tuple[str, np.ndarray]], found: ImuCalibratio
     """A calibration with what the poses of both sensors on one body tell."""
     camera, sensor = bodies.get("camera"), bodies.get("imu")
     if camera is None:
-        if sensor is None or np.allclose(sensor[1], [0, 0, 0, 0, 0, 0, 1], atol=1e-9):
+        if sensor is not None and found.noise is None and found.T_camera_imu is None and found.time_offset is None:
+            raise DvoError("states nothing of an inertial sensor", file=sensor[0], remedy=_REMEDY)
+        is_body = sensor is None or np.allclose(sensor[1], [0, 0, 0, 0, 0, 0, 1], atol=1e-9)
+        if is_body or found.T_camera_imu is not None:
             return found
+        assert sensor is not None
         message, file = "places the sensor on a body, whose pose in the camera is not stated", sensor[0]
         remedy = "give sensor.yaml of the camera too, or T_camera_imu in a YAML file"
         raise DvoError(message, file=file, field="T_BS", remedy=remedy)
@@ -160,8 +164,7 @@ def _read(given: str) -> tuple[ImuCalibration, tuple[str, np.ndarray] | None]:
         _check_arm(found.T_camera_imu, path, "T_camera_imu")
     kind = "camera" if entries.values.get("sensor_type", "") == "camera" or "camera_model" in entries.values else "imu"
     body = None if on_body is None else (kind, on_body)
-    states = (found.noise, found.T_camera_imu, found.time_offset)
-    if all(part is None for part in states) and (body is None or kind == "imu"):
+    if found.noise is None and found.T_camera_imu is None and found.time_offset is None and body is None:
         raise DvoError("states nothing of an inertial sensor", file=path, remedy=_REMEDY)
     return found, body
 

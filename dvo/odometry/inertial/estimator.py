@@ -52,9 +52,11 @@ ROUNDS, FINAL_ITERATIONS = 3, 25
 """Estimates at the end of a recording, and Gauss-Newton steps of each."""
 MAX_GRAVITY_SIGMA = 1.5
 """Standard deviation of the vertical that an alignment needs, degrees."""
-LOST_SCALE, UNSURE_SCALE = 0.2, 0.1
-"""Relative deviation of the scale of a world that was aligned above which it is not known any more, and up to which the
-adjustment of images and samples is asked for one that was not; and above which an estimate does not replace another."""
+LOST_SCALE = 0.2
+"""Relative deviation of the scale above which that of an aligned world is not known any more; up to it, the adjustment
+of images and samples may make sure of that of another one."""
+UNSURE_SCALE = 0.1
+"""Relative deviation of the scale above which an estimate does not replace the one before it."""
 NOTHING_TOLD = 0.5
 """Relative deviation of the scale above which the motion tells nothing of it."""
 MAX_ERROR = 6.0
@@ -91,10 +93,11 @@ MOST_PATIENCE = 2.0
 CLOSER = 0.5
 """Share of the deviation of the scale that an alignment needs, where the adjustment of images and samples tells it: the
 noise of the images is assumed there, and errors of the camera's calibration are not in it."""
-PATIENT = 1.5
-"""Seconds for which the estimate has been unsure before the adjustment is asked: samples of a good sensor need none."""
 ADJUSTED_SIGMA = 0.75
-"""The same, of the deviation while the recording goes on, of two adjustments in a row."""
+"""The same share while the recording goes on, of each of two adjustments in a row."""
+PATIENT = 1.5
+"""Seconds after the first estimate that is unsure of the scale, before the adjustment is asked: with a good sensor the
+next ones are sure."""
 _WAITING = ("too few poses", "too few samples")
 _UNCERTAIN = "the scale is uncertain"
 SURE_OFFSET, SURE_TURN = 3e-3, 0.5
@@ -199,9 +202,10 @@ class InertialEstimator:
         self.translation_camera_imu: Array = np.zeros(3)
         self.first_offset = 0.0  # time offset that the first estimate begins with, seconds
         self._candidate: tuple[float, float] | None = None  # log scale and its deviation, of an estimate that passed
-        self._unsure: tuple[Smoothed, VisualNodes, int] | None = None  # estimate whose scale is not sure, and its world
-        self._unsure_since = np.inf  # time of the first of them
         self._adjusted: tuple[float, float] | None = None  # the same of an adjustment of images and samples
+        self._unsure: tuple[Smoothed, VisualNodes, int] | None = None  # estimate whose scale is not sure, and its world
+        self._unsure_since = np.inf  # time of the first of them, since the start or a withdrawal
+        self._untaken = 0.0  # deviation of the scale of an estimate that has not replaced the one before it
         self._failures, self._patience = 0, AT_FIRST
         self._next = self._whole = -np.inf  # times of the next estimate, and of the last one of the whole window
         self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
@@ -221,6 +225,11 @@ class InertialEstimator:
         """True if samples tell the acceleration well enough to be a measurement for the window."""
         most = MAX_FORCE_SIGMA if self._adjusted is None else MAX_ADJUSTED_FORCE_SIGMA
         return self.aligned and self.force_sigma <= most
+
+    @property
+    def scale_sigma(self) -> float:
+        """Relative deviation of the scale, also by an estimate that was too unsure to be taken; inf without one."""
+        return np.inf if self.solution is None else max(self.solution.scale_sigma, self._untaken)
 
     @property
     def force_sigma(self) -> float:
@@ -312,7 +321,9 @@ class InertialEstimator:
             self._refuse(reason, time)
             return
         if worlds[-1] in self.worlds and found.scale_sigma > UNSURE_SCALE:
+            self._untaken = found.scale_sigma
             return
+        self._untaken = 0.0
         self._held = float(found.times[problem.held])
         self._accept(found, worlds, time)
 
@@ -415,7 +426,7 @@ class InertialEstimator:
         self.solution = replace(states, log_scale=np.repeat(log_scale, len(states.times)), worlds=known, past=None)
         self.worlds[world], self._known, self._failures = similarity, [world], 0
         self._next = self._whole = -np.inf
-        self._adjusted = float(log_scale[0]), scale_sigma
+        self._adjusted, self._untaken = (float(log_scale[0]), scale_sigma), 0.0
         if not self.aligned:
             self.state, self.reason, self._aligned, self._offset = ScaleState.ALIGNED, "", time, states.time_offset
             self._unsure, self._held = None, time
@@ -952,7 +963,7 @@ class InertialEstimator:
             self.history.append({"time": time, "event": "withdrawn", "reason": reason})
             self.state, self.reason = ScaleState.INITIALISING, f"withdrawn: {reason}"
             self.worlds, self.solution, self._known, self._failures, self._past = {}, None, [], 0, []
-            self._unsure = self._adjusted = None
+            self._unsure, self._adjusted, self._unsure_since, self._untaken = None, None, np.inf, 0.0
 
     def _accept(self, found: Smoothed, worlds: list[int], time: float) -> None:
         """Take an estimate that has passed; the first one has to be confirmed by another."""

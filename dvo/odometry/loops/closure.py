@@ -176,6 +176,7 @@ class LoopCloser:
         """
         if self.adjuster is not None:
             self.adjuster.end()
+        self.maintenance.awaited = False  # nothing else comes
         corrected = self.advance(segments, at_once=True)
         if not self.enabled:
             return corrected

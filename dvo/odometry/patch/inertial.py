@@ -63,9 +63,10 @@ ANOTHER_CLOCK = 86400.0
 """Seconds between a sample and the newest frame that are no pause and no delay."""
 MOST_NODES = 400
 """Nodes of the estimate at the end of a sequence."""
-ADJUST_EVERY, ADJUST_LATER, ADJUSTED = 1.0, 3.0, 10.0
-"""Seconds from one adjustment of images and samples beside tracking to the next, before the alignment and after it, and
-of frames that are solved for."""
+ADJUST_EVERY, ADJUST_LATER = 1.0, 3.0
+"""Seconds from one adjustment of images and samples beside tracking to the next, before the alignment and after it."""
+ADJUSTED, MOST_ADJUSTED = 10.0, 400
+"""Seconds of frames that are solved for, and frames at most."""
 HARD = 0.05
 """Deviation of the acceleration, m/s^2, above which they follow each other after the alignment as before it."""
 ADJUST_DELAY, ADJUST_TOLERANCE = 10, 1e-3
@@ -340,7 +341,7 @@ class InertialTracking:
         self, graph: Map, world: int, start: Smoothed, path: MetricPath | None, options: AdjustmentOptions,
         shutter: Shutter | None,
     ) -> InertialAdjustment:  # fmt: skip
-        """Adjustment of images and samples of a world; see there."""
+        """Adjustment of images and samples of a world; see :class:`InertialAdjustment`."""
         samples, estimator = self.estimator.stream.samples(), self.estimator
         assert samples is not None
         return InertialAdjustment(
@@ -381,7 +382,9 @@ class InertialTracking:
         snapshot.archive.config = replace(snapshot.archive.config, features=False, images=False)
         snapshot.archive_window()
         work = self._adjustment(snapshot, world, known, path, options, rows)
-        work = replace(work, since=time - ADJUSTED, tolerance=ADJUST_TOLERANCE)
+        newest = snapshot.members(world)[-MOST_ADJUSTED:]
+        since = max(time - ADJUSTED, newest[0].timestamp) if newest else time - ADJUSTED
+        work = replace(work, since=since, tolerance=ADJUST_TOLERANCE)
         begun = _Begun(graph.segment, world, similarity is not None)
         maintenance.job = maintenance.beside("adjustment", work.solve, partial(self._apply, begun), ADJUST_DELAY)
 
@@ -391,9 +394,11 @@ class InertialTracking:
         now = _Begun(graph.segment, graph.world_of(graph.segment), similarity is not None)
         if solution is None or now != begun or self._anchor is not None or not len(graph.window):
             return Moved({})
-        if not estimator.confirms(metres_per_unit(graph, solution), solution.scale_sigma):
+        scale = metres_per_unit(graph, begun.world, solution)
+        if scale is None or not estimator.confirms(scale, solution.scale_sigma):
             return Moved({})
         applied = apply_solution(graph, begun.world, solution, similarity)
+        assert applied is not None
         estimator.adopt(applied.states, applied.similarity, begun.world, solution.scale_sigma)
         for carried in applied.moved.worlds:
             self._carry(carried)
@@ -554,7 +559,7 @@ class InertialTracking:
             estimate.timestamp, pose_from(rotation, position), Status.INERTIAL, 0.0, estimate.segment, reason,
             covariance=own @ grown @ own.T, reference=anchor.time, scale_state=estimator.state,
             inertial=InertialEstimate(
-                state.velocity, state.gyro_bias, state.accel_bias, estimator.solution.scale_sigma,
+                state.velocity, state.gyro_bias, state.accel_bias, estimator.scale_sigma,
                 camera_covariance(state, turn, estimator.translation_camera_imu), estimator.solution.time_offset,
             ),
         )  # fmt: skip
@@ -566,7 +571,12 @@ class InertialTracking:
             return None
         state, covariance = self.estimator.beside(time, rotation, position)
         return InertialEstimate(
-            state.velocity, state.gyro_bias, state.accel_bias, solution.scale_sigma, covariance, solution.time_offset
+            state.velocity,
+            state.gyro_bias,
+            state.accel_bias,
+            self.estimator.scale_sigma,
+            covariance,
+            solution.time_offset,
         )
 
     def _visual_cw(self, state: BodyState, similarity: Similarity) -> Tensor:

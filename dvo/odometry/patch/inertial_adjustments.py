@@ -16,7 +16,7 @@ from torch import Tensor
 from dvo.data.inertial import ImuNoise, InertialSamples
 from dvo.geometry import se3
 from dvo.geometry.poses import matrix_to_quaternion, pose_from, quaternion_to_matrix, slerp, so3_exp, split
-from dvo.map.correction import Moved, set_solution
+from dvo.map.correction import Moved, keyframes_of, set_solution
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.map import Map
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
@@ -136,6 +136,8 @@ class InertialAdjustment:
         if int(linked.sum()) < 3:
             return None
         part, times = part.select(linked).planned(), times[linked.numpy()]
+        if not len(part.kk):
+            return None
         if self.path is not None:
             moved, scales = self.path.moved(times, se3.inverse(part.poses_cw).numpy())
             depths = part.inverse_depths.view(len(times), -1) / torch.from_numpy(scales)[:, None]
@@ -167,7 +169,7 @@ class Applied:
 
 def apply_solution(
     graph: KeyframeGraph, world: int, solution: VisualInertialSolution, known: Similarity | None
-) -> Applied:
+) -> Applied | None:
     """Let map and window take a solution; the newest keyframe that was solved for keeps place and heading.
 
     Args:
@@ -176,13 +178,19 @@ def apply_solution(
         solution: in metres.
         known: from the world of visual poses to the metric one; None: not known so far, and the newest keyframe keeps
             its pose and unit in the world of visual poses.
+
+    Returns:
+        None if no keyframe of it is left, and nothing is changed.
     """
-    row, old_wc, _ = _newest_kept(graph, solution.identifiers)
+    newest = _newest_kept(graph, world, solution)
+    if newest is None:
+        return None
+    row, old_wc, own_depths = newest
     rotation, position = split(se3.inverse(solution.poses_cw).numpy())
     states, depths = solution.states, solution.depths.numpy()
     own_rotation, own_position = split(old_wc.numpy())
     if known is None:
-        scale = metres_per_unit(graph, solution)
+        scale = float(np.median(own_depths / depths[row]))
         turn = rotation[row] @ own_rotation.T
         known = Similarity(scale, turn, position[row] - scale * turn @ own_position)
     else:
@@ -201,27 +209,35 @@ def apply_solution(
     return Applied(moved, states, known)
 
 
-def metres_per_unit(graph: KeyframeGraph, solution: VisualInertialSolution) -> float:
+def metres_per_unit(graph: KeyframeGraph, world: int, solution: VisualInertialSolution) -> float | None:
     """Scale of the newest keyframe of a solution, metres in a unit that it has in the graph.
 
     Args:
         graph: as it is before it takes the solution.
+        world: number of the world.
         solution: in metres.
+
+    Returns:
+        None if no keyframe of it is left.
     """
-    row, _, depths = _newest_kept(graph, solution.identifiers)
-    return float(np.median(depths / solution.depths[row].numpy()))
+    newest = _newest_kept(graph, world, solution)
+    return None if newest is None else float(np.median(newest[2] / solution.depths[newest[0]].numpy()))
 
 
-def _newest_kept(graph: KeyframeGraph, identifiers: Tensor) -> tuple[int, Tensor, np.ndarray]:
-    """Row, pose ``T_wc`` and inverse depths of the newest keyframe that was not dropped."""
+def _newest_kept(
+    graph: KeyframeGraph, world: int, solution: VisualInertialSolution
+) -> tuple[int, Tensor, np.ndarray] | None:
+    """Row, pose ``T_wc`` and inverse depths of the newest keyframe that has not been dropped since."""
     window, m, centre = graph.window, graph.per_frame, graph.window.patches.shape[-1] // 2
-    places = {frame.identifier: place for place, frame in enumerate(window.frames) if not frame.guest}
-    for row, identifier in reversed(list(enumerate(identifiers.tolist()))):
+    here = graph.world_of(graph.segment) == world
+    places = {frame.identifier: place for place, frame in enumerate(window.frames) if here and not frame.guest}
+    archived = set(keyframes_of(graph, world).tolist())
+    for row, identifier in reversed(list(enumerate(solution.identifiers.tolist()))):
         if identifier in places:
             place = places[identifier]
             depths = window.patches[place * m : (place + 1) * m, 2, centre, centre].double().cpu().numpy()
             return row, se3.inverse(window.poses_cw[place].double().cpu()), depths
-        frame = graph.archive[identifier]
-        if frame.anchor is None:
+        if identifier in archived and len(graph.archive[identifier].inverse_depth):
+            frame = graph.archive[identifier]
             return row, se3.inverse(torch.from_numpy(frame.pose_cw)), frame.inverse_depth
-    raise AssertionError("a world begins with a keyframe that is kept")
+    return None

@@ -201,6 +201,7 @@ class PatchOdometry:
             return estimate
         moved = not admitted.repeated and (self.aligner is None or self.aligner.age == 0)
         expressed = self.inertial.express(record, estimate, moved=moved)
+        self.loops.maintenance.awaited &= state.initialised
         if moved and state.initialised and self.config.final_adjustment:
             self.inertial.adjust(self.loops.maintenance, self.config.adjustment, state.shutter)
         return expressed

@@ -95,6 +95,13 @@ def test_camera_and_sensor_on_one_body(tmp_path):
     stated = write(tmp_path, f"T_camera_imu: {turn.ravel().tolist()}\n", "own.yaml")
     with pytest.raises(DvoError, match="T_camera_imu: is stated twice"):
         read_imu_calibration([seen, sensor, stated])
+    # Beside a pose in the camera, that on a body is of no use; beside a preset, that of both is.
+    assert np.allclose(read_imu_calibration([sensor, stated]).T_camera_imu[:3], turn[:3, 3])
+    bare = write(tmp_path, placed("imu", turn), "bare.yaml")
+    assert np.allclose(read_imu_calibration(["phone", seen, bare]).T_camera_imu[:3], expected[:3, 3])
+    for alone in (bare, write(tmp_path, placed("imu", np.eye(4)), "identity.yaml")):
+        with pytest.raises(DvoError, match="states nothing of an inertial sensor"):
+            read_imu_calibration(alone)
     camera[0, 3] = 150.0
     far = write(tmp_path, placed("camera", camera), "millimetres.yaml")
     with pytest.raises(DvoError, match=r"T_BS: the sensor is 149.9 m from the camera"):

@@ -20,30 +20,11 @@ from dvo.geometry.poses import rotation_vector, split
 from dvo.odometry.global_ba.graph_adjustment import Adjusted
 from dvo.odometry.global_ba.inertial_adjustment import VisualInertialSolution as Solution
 from dvo.odometry.inertial.estimator import Similarity
-from dvo.odometry.inertial.smoother import Similarities, Smoothed, spaced
+from dvo.odometry.inertial.smoother import Smoothed, spaced
 from dvo.odometry.patch.inertial import _led, _runs, _turns_of
-from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Estimate, ScaleState, Status
-from tests.support.steady_samples import IDENTITY, UPRIGHT, with_samples
+from tests.support.steady_samples import IDENTITY, SPEED, UPRIGHT, align, with_samples
 from tests.support.tiny_tracker import SMALL, frames, plain, tracker
-
-SPEED = np.array([0.4, 0.0, 0.0])
-
-
-def align(odometry: PatchOdometry, time: float) -> None:
-    """Give the estimator an alignment: two metres a unit, upright."""
-    estimator = odometry.inertial.estimator
-    estimator.state, estimator.reason = ScaleState.ALIGNED, ""
-    estimator.worlds = {0: Similarity(2.0, UPRIGHT, np.zeros(3))}
-    worlds = Similarities(np.log([2.0]), UPRIGHT[None], np.zeros((1, 3)))
-    rows, zero = np.zeros((1, 3)), np.zeros((1, 3))
-    covariance = 1e-6 * np.eye(19 + 8)
-    estimator.solution = Smoothed(
-        np.array([time]), np.zeros(1, int), UPRIGHT[None], rows, SPEED[None], zero, zero, np.log([2.0]), worlds, 0.0,
-        np.eye(3), np.zeros(3), 1.0, covariance, 0.0, 0.0, np.zeros(2),
-    )  # fmt: skip
-    estimator.update = lambda nodes, worlds: None  # type: ignore[method-assign]
-    estimator.settle = lambda nodes, worlds, confirm: estimator.solution  # type: ignore[method-assign]
 
 
 def dark(images: list[Frame], first: int, last: int) -> list[Frame]:

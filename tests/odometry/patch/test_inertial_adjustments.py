@@ -19,10 +19,11 @@ from dvo.odometry.inertial.estimator import Similarity
 from dvo.odometry.inertial.smoother import GRAVITY, Similarities, Smoothed, VisualNodes
 from dvo.odometry.patch.inertial import ADJUST_DELAY, ADJUST_EVERY, _Begun
 from dvo.odometry.patch.inertial_adjustments import InertialAdjustment, MetricPath, apply_solution, metres_per_unit
+from dvo.odometry.patch.state import Phase
 from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import ScaleState
 from tests.support.archived_walk import archived_walk, pose_at
-from tests.support.steady_samples import IDENTITY, UPRIGHT, with_samples
+from tests.support.steady_samples import IDENTITY, UPRIGHT, align, with_samples
 from tests.support.tiny_tracker import frames, tracker
 
 KNOWN = Similarity(2.0, so3_exp(np.array([-1.2, 0.3, 0.4])), np.array([3.0, -1.0, 0.5]))
@@ -70,8 +71,9 @@ def test_without_a_known_similarity_the_newest_keyframe_keeps_pose_and_unit() ->
     graph = walk()
     before, depths = newest(graph), graph.window.patches[-8:, 2].clone()
     solution = in_metres(graph, KNOWN)
-    assert metres_per_unit(graph, solution) == pytest.approx(KNOWN.scale, rel=1e-5)
+    assert metres_per_unit(graph, 0, solution) == pytest.approx(KNOWN.scale, rel=1e-5)
     applied = apply_solution(graph, 0, solution, None)
+    assert applied is not None
     assert np.allclose(newest(graph), before, atol=1e-5) and torch.allclose(graph.window.patches[-8:, 2], depths)
     assert applied.similarity.scale == pytest.approx(KNOWN.scale, rel=1e-5)
     assert np.allclose(applied.similarity.rotation, KNOWN.rotation, atol=1e-5)
@@ -84,6 +86,7 @@ def test_in_a_metric_world_the_newest_keyframe_keeps_place_and_heading_and_takes
     place = KNOWN.points(split(newest(graph))[1])
     shape = [solution_positions(in_metres(graph, turned, 1.1))]
     applied = apply_solution(graph, 0, in_metres(graph, turned, 1.1), KNOWN)
+    assert applied is not None
     rotation, position = split(newest(graph))
     assert applied.similarity is KNOWN and np.allclose(KNOWN.points(position), place, atol=1e-4)
     assert np.allclose(applied.states.position[-1], place, atol=1e-4)
@@ -189,3 +192,47 @@ def test_the_adjustment_of_a_part_of_the_map_finds_its_motion_in_metres(since: f
     assert np.allclose(*lengths, rtol=0.01) and found.scale_sigma < 0.02
     up = split(se3.inverse(found.poses_cw).numpy())[0][:, 2]
     assert np.allclose(up, (UPRIGHT @ split(truth.poses_wc)[0][wanted])[:, 2], atol=5e-3)
+
+
+def test_a_solution_whose_keyframes_are_gone_is_not_taken() -> None:
+    """As of a camera that stands still for long: the frames of the last seconds have been dropped meanwhile."""
+    odometry = tracker()
+    for frame in with_samples(frames(20)):
+        odometry.track(frame)
+    tracking, graph = odometry.inertial, odometry.graph
+    whole = in_metres(graph, KNOWN)
+    for gone in (np.array([10_000]), np.array([k.identifier for k in graph.archive if k.anchor is not None][:1])):
+        solution = replace(
+            whole, identifiers=torch.from_numpy(gone), poses_cw=whole.poses_cw[: len(gone)],
+            depths=whole.depths[: len(gone)],
+        )  # fmt: skip
+        assert metres_per_unit(graph, 0, solution) is None and apply_solution(graph, 0, solution, KNOWN) is None
+        before = odometry.window.poses_cw.clone()
+        assert not tracking._apply(_Begun(0, 0, False), solution) and not tracking.estimator.aligned
+        assert torch.equal(odometry.window.poses_cw, before)
+
+
+@pytest.mark.parametrize("end", ["complete", "lost"])
+def test_searches_go_on_where_no_adjustment_follows(end: str) -> None:
+    odometry = tracker()
+    for frame in with_samples(frames(12)):
+        odometry.track(frame)
+    odometry.loops.maintenance.awaited = True
+    if end == "complete":
+        odometry.finish()
+    else:
+        odometry.state.phase = Phase.INITIALISING
+        odometry.track(with_samples(frames(13))[12])
+    assert not odometry.loops.maintenance.awaited
+
+
+def test_the_doubt_of_an_estimate_that_is_not_taken_is_told() -> None:
+    odometry = tracker()
+    for frame in with_samples(frames(12)):
+        odometry.track(frame)
+    estimator = odometry.inertial.estimator
+    align(odometry, 1.1)
+    assert estimator.scale_sigma == pytest.approx(1e-3 * np.sqrt(2), rel=0.01)
+    estimator._untaken = 0.15
+    told = odometry.track(with_samples(frames(13))[12])
+    assert told.inertial is not None and told.inertial.scale_sigma == 0.15

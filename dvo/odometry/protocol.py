@@ -39,7 +39,7 @@ class ScaleState(StrEnum):
     """What inertial samples have told of scale and vertical."""
 
     NONE = "none"  # there are no samples, or they are not used
-    INITIALISING = "initialising"  # poses are as without samples
+    INITIALISING = "initialising"  # poses are as without samples; or in metres, and their scale is in doubt for now
     ALIGNED = "aligned"  # poses are in metres, and z points up
     REFINED = "refined"  # for long enough that the scale changes little
 
@@ -94,7 +94,7 @@ class Estimate:
         reference: timestamp of the reference, seconds: the oldest keyframe of the window that a measurement still
             reaches; None without one. Of the status ``inertial``, the last frame with a pose by its image.
         scale_state: of the pose, where inertial samples are used.
-        inertial: velocity, biases and more, once they are known (``aligned``).
+        inertial: velocity, biases and more, of a pose in metres by samples.
 
     ``confidence``, ``covariance`` and ``reference`` may be functions, which are called when the value is first read.
 

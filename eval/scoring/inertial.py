@@ -8,9 +8,9 @@ Definitions:
 - The time to alignment runs from the first frame, or from the end of a degenerate stretch in which the sequence begins,
   to the first time from which the scale stays within :data:`SCALE_PERCENT` percent, whatever the system says of itself.
 - NEES (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, 5.4.2) is
-  ``e^T P^-1 e`` over its dimension, mean over the aligned frames, 1 if consistent. Yaw and position of the pose at the
-  alignment are taken as right, as they cannot be observed; also after segments that share its world.
-- An alignment is wrong if the scale of the poses that follow it, until the system withdraws it, is off by
+  ``e^T P^-1 e`` over its dimension, mean over the frames with a covariance, 1 if consistent. Yaw and position of the
+  pose at the alignment are taken as right, as they cannot be observed; also after segments that share its world.
+- An alignment is wrong if the scale of the poses that follow it, as long as the system calls them aligned, is off by
   :data:`WRONG_PERCENT` percent in the median of any :data:`JUDGED` seconds with motion, or gravity by
   :data:`WRONG_DEGREES` degrees.
 """
@@ -132,7 +132,8 @@ def inertial_errors(
     for begin, end in dark:
         spent |= (streamed.timestamps > begin - SAME_FRAME) & (streamed.timestamps < end + SAME_FRAME)
     tracked = streamed.status == "tracking"
-    position, orientation, velocity = run.nees(aligned, _worlds(streamed, segments))
+    metric = aligned | np.isfinite(streamed.covariance).all(axis=(1, 2))  # also where the scale is in doubt for now
+    position, orientation, velocity = run.nees(metric, _worlds(streamed, segments))
     dark_cm, dark_percent, dark_sigmas = run.in_the_dark(dark)
     return InertialErrors(
         scale_10s=100 * abs(pairs.scale(origin + 10, origin + 15) - 1),
@@ -205,10 +206,10 @@ class _Run:
         upright = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1.0]])
         return upright, self.true_position[at] - upright @ self.position[at]
 
-    def nees(self, aligned: np.ndarray, worlds: np.ndarray) -> tuple[float, float, float]:
-        """Of position, orientation and velocity, over the aligned frames that have a covariance; worlds ``(N,)``."""
+    def nees(self, metric: np.ndarray, worlds: np.ndarray) -> tuple[float, float, float]:
+        """Of position, orientation and velocity, over the frames in metres with a covariance; worlds ``(N,)``."""
         found: list[list[float]] = [[], [], []]
-        for begin, end in _stretches_of(aligned, worlds):
+        for begin, end in _stretches_of(metric, worlds):
             if not (np.isfinite(self.position[begin]).all() and np.isfinite(self.true_position[begin]).all()):
                 continue
             upright, shift = self.gauge(begin)

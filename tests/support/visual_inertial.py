@@ -44,7 +44,7 @@ class Recording:
         inside = np.flatnonzero((self.times >= start) & (self.times <= end))
         chosen = np.union1d(inside[inside % step == 0], inside[[0, -1]])
         none = np.zeros(len(chosen), int)
-        depth = np.array([DEPTH / SCALE])
+        depth = np.full(len(chosen), DEPTH / SCALE)
         return VisualNodes(self.times[chosen], none, self.rotation[chosen], self.position[chosen], depth)
 
     def problem(self, start: float, end: float) -> Smoother:

@@ -53,10 +53,10 @@ ROUNDS, FINAL_ITERATIONS = 3, 25
 MAX_GRAVITY_SIGMA = 1.5
 """Standard deviation of the vertical that an alignment needs, degrees."""
 LOST_SCALE = 0.2
-"""Relative deviation of the scale above which that of an aligned world is not known any more; up to it, the adjustment
-of images and samples may make sure of that of another one."""
-UNSURE_SCALE = 0.1
-"""Relative deviation of the scale above which an estimate does not replace the one before it."""
+"""Relative deviation of the scale above which an alignment is withdrawn, if it lasts for as long as samples alone may
+predict poses; up to it, the adjustment of images and samples may make sure of that of a world that is not aligned."""
+UNSURE_SCALE, SURE_SCALE = 0.1, 0.05
+"""Relative deviation of the scale above which a world in metres is not called aligned, and down to which it is."""
 NOTHING_TOLD = 0.5
 """Relative deviation of the scale above which the motion tells nothing of it."""
 MAX_ERROR = 6.0
@@ -205,7 +205,7 @@ class InertialEstimator:
         self._adjusted: tuple[float, float] | None = None  # the same of an adjustment of images and samples
         self._unsure: tuple[Smoothed, VisualNodes, int] | None = None  # estimate whose scale is not sure, and its world
         self._unsure_since = np.inf  # time of the first of them, since the start or a withdrawal
-        self._untaken = 0.0  # deviation of the scale of an estimate that has not replaced the one before it
+        self._doubtful, self._known_at = False, -np.inf  # the scale is not known for now; when it was, roughly
         self._failures, self._patience = 0, AT_FIRST
         self._next = self._whole = -np.inf  # times of the next estimate, and of the last one of the whole window
         self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
@@ -217,8 +217,18 @@ class InertialEstimator:
 
     @property
     def aligned(self) -> bool:
-        """True if poses are in metres."""
+        """True if poses are in metres, also where the scale is not known for now."""
         return self.state in (ScaleState.ALIGNED, ScaleState.REFINED)
+
+    @property
+    def scale_state(self) -> ScaleState:
+        """What is known of the present scale."""
+        return ScaleState.INITIALISING if self.aligned and self._doubtful else self.state
+
+    @property
+    def holds_unit(self) -> bool:
+        """True if samples alone hold the unit of the window."""
+        return self.aligned and self.force_sigma <= MAX_FORCE_SIGMA
 
     @property
     def leads(self) -> bool:
@@ -228,8 +238,8 @@ class InertialEstimator:
 
     @property
     def scale_sigma(self) -> float:
-        """Relative deviation of the scale, also by an estimate that was too unsure to be taken; inf without one."""
-        return np.inf if self.solution is None else max(self.solution.scale_sigma, self._untaken)
+        """Relative deviation of the scale; inf without an estimate."""
+        return np.inf if self.solution is None else self.solution.scale_sigma
 
     @property
     def force_sigma(self) -> float:
@@ -315,15 +325,13 @@ class InertialEstimator:
         if unsure and not self.aligned:
             self._unsure = _from_first_camera(found), problem.nodes, worlds[-1]
             self._unsure_since = min(self._unsure_since, time)
-        if not reason and worlds[-1] in self.worlds and found.scale_sigma > LOST_SCALE:
-            reason = f"{_UNCERTAIN} by {100 * found.scale_sigma:.0f} %"
+        if worlds[-1] not in self.worlds or found.scale_sigma <= LOST_SCALE:
+            self._known_at = time
+        elif not reason and time - self._known_at > self.options.longest:
+            reason, self._failures = f"{_UNCERTAIN} by {100 * found.scale_sigma:.0f} %", FAILURES  # at once
         if reason:
             self._refuse(reason, time)
             return
-        if worlds[-1] in self.worlds and found.scale_sigma > UNSURE_SCALE:
-            self._untaken = found.scale_sigma
-            return
-        self._untaken = 0.0
         self._held = float(found.times[problem.held])
         self._accept(found, worlds, time)
 
@@ -393,7 +401,7 @@ class InertialEstimator:
             return self._unsure[:2] if waited and self._unsure is not None and self._unsure[2] == world else None
         if self.solution is None or world not in self.worlds or self._known[-1:] != [world]:
             return None
-        return (self.solution, None) if self.force_sigma > MAX_FORCE_SIGMA else None
+        return None if self.holds_unit else (self.solution, None)
 
     def confirms(self, scale: float, scale_sigma: float) -> bool:
         """Find out if the solution of an adjustment can be taken; an alignment needs two in a row that agree.
@@ -426,10 +434,10 @@ class InertialEstimator:
         self.solution = replace(states, log_scale=np.repeat(log_scale, len(states.times)), worlds=known, past=None)
         self.worlds[world], self._known, self._failures = similarity, [world], 0
         self._next = self._whole = -np.inf
-        self._adjusted, self._untaken = (float(log_scale[0]), scale_sigma), 0.0
+        self._adjusted = float(log_scale[0]), scale_sigma
         if not self.aligned:
             self.state, self.reason, self._aligned, self._offset = ScaleState.ALIGNED, "", time, states.time_offset
-            self._unsure, self._held = None, time
+            self._unsure, self._held, self._known_at = None, time, time
             self.history.append({"time": time, "event": "aligned", "scale_sigma": scale_sigma})
             state = self.last_state()
             assert state is not None
@@ -649,6 +657,7 @@ class InertialEstimator:
                 {"time": self._aligned, "event": "aligned at the end", "scale_sigma": sigma or found.scale_sigma}
             )
         self._take(found, worlds)
+        self._doubtful, self.reason = False, ""  # that was of the newest poses
         return found
 
     # ------------------------------------------------------------------------------------------------------------------
@@ -667,7 +676,7 @@ class InertialEstimator:
         if problem is None or problem.nodes.times[0] != nodes.times[0]:
             return False
         count, present = len(self._known), problem.nodes
-        problem.nodes = replace(present, segment=present.segment + count - 1, depth=np.full(count, present.depth[0]))
+        problem.nodes = replace(present, segment=present.segment + count - 1)
         problem.past, problem.held = past, -1 if past.holds else problem.held
         problem.options = replace(self._smoother, iterations=1)
         try:
@@ -710,7 +719,9 @@ class InertialEstimator:
         if not GRAVITY_RANGE[0] <= force <= GRAVITY_RANGE[1]:
             return None, worlds, f"the median specific force is {force:.3g} m/s^2 where gravity is 9.81: units, or axes"
         lever = -turn.T @ self.translation_camera_imu
-        problem = Smoother(nodes, near, self.noise, turn, lever, self._smoother, offset=offset)
+        problem = Smoother(
+            nodes, near, self.noise, turn, lever, self._smoother, offset=offset, unit_held=self.holds_unit
+        )  # fmt: skip
         if self.solution is None:
             problem.held = len(nodes) - 1
         else:
@@ -963,7 +974,7 @@ class InertialEstimator:
             self.history.append({"time": time, "event": "withdrawn", "reason": reason})
             self.state, self.reason = ScaleState.INITIALISING, f"withdrawn: {reason}"
             self.worlds, self.solution, self._known, self._failures, self._past = {}, None, [], 0, []
-            self._unsure, self._adjusted, self._unsure_since, self._untaken = None, None, np.inf, 0.0
+            self._unsure, self._adjusted, self._unsure_since, self._doubtful = None, None, np.inf, False
 
     def _accept(self, found: Smoothed, worlds: list[int], time: float) -> None:
         """Take an estimate that has passed; the first one has to be confirmed by another."""
@@ -988,6 +999,13 @@ class InertialEstimator:
         if time - self._aligned >= REFINED_AFTER:
             self.state = ScaleState.REFINED
 
+    def _tell(self) -> None:
+        """Note if the present scale is known."""
+        if not self.aligned:
+            return
+        self._doubtful = self.scale_sigma > (SURE_SCALE if self._doubtful else UNSURE_SCALE)
+        self.reason = f"{_UNCERTAIN} by {100 * self.scale_sigma:.0f} % for now" if self._doubtful else ""
+
     def _take(self, found: Smoothed, worlds: list[int]) -> None:
         """Let poses follow an estimate."""
         self._known = list(worlds[: len(found.worlds.log_scale)])
@@ -1001,6 +1019,7 @@ class InertialEstimator:
 
     def _follow(self, found: Smoothed) -> None:
         self.solution = found
+        self._tell()
         for k, world in enumerate(self._known):
             w = found.worlds
             self.worlds[world] = Similarity(float(np.exp(w.log_scale[k])), w.rotation[k], w.translation[k])

@@ -44,6 +44,11 @@ RECENT = 2.0
 HASTE = 2.0
 """Angular rate, rad/s, at which images tell a motion half as well as at rest, and then worse with its square: blur, and
 little that is seen for long."""
+CARRIED, MOST_CARRIED = 15.0, 30.0
+"""Angular rate over the rate of parallax (speed over depth of the scene) at which the unit that images carry from what
+leaves the view to what enters it drifts twice as fast as at rest, and then with its square; and factor at most."""
+LEAST_PARALLAX = 1e-3
+"""Rate of parallax, rad/s, below which it is noise."""
 USUAL = 10.0
 """Measurements that the usual noise of visual poses counts for, where it is estimated."""
 OPPOSED = -0.5
@@ -64,7 +69,7 @@ class VisualNodes:
         segment: ``(N,)`` numbers from 0, increasing, each with a world and a unit of its own.
         rotation: ``(N, 3, 3)`` camera to world of the segment.
         position: ``(N, 3)`` of the camera, units of the segment.
-        depth: ``(S,)`` usual depth of the scene of each segment, units of the segment.
+        depth: ``(N,)`` usual depth of the scene that is seen, units of the segment.
     """
 
     times: Array
@@ -79,7 +84,7 @@ class VisualNodes:
     def where(self, keep: Array) -> tuple[VisualNodes, Array]:
         """Nodes that are chosen by a mask ``(N,)``, and the numbers so far of the segments that are left."""
         left, segment = np.unique(self.segment[keep], return_inverse=True)
-        nodes = VisualNodes(self.times[keep], segment, self.rotation[keep], self.position[keep], self.depth[left])
+        nodes = VisualNodes(self.times[keep], segment, self.rotation[keep], self.position[keep], self.depth[keep])
         return nodes, left
 
     def of(self, segment: int) -> VisualNodes:
@@ -298,6 +303,8 @@ class Smoother:
         offset: time offset known before, seconds.
         held: node whose heading and position are held, as the samples do not tell them.
         past: of the first node; None: there is nothing before it.
+        unit_held: samples hold the unit of the window, which does not drift faster where the camera turns far from the
+            scene; nor are its displacements worse there.
     """
 
     nodes: VisualNodes
@@ -311,7 +318,8 @@ class Smoother:
     offset: float = 0.0
     held: int = 0
     past: Past | None = None
-    _haste: tuple[VisualNodes, Array] | None = field(default=None, init=False, repr=False)
+    unit_held: bool = False
+    _turned: tuple[VisualNodes, Array] | None = field(default=None, init=False, repr=False)
 
     @property
     def segments(self) -> int:
@@ -319,15 +327,35 @@ class Smoother:
         return int(self.nodes.segment[-1]) + 1
 
     @property
-    def haste(self) -> Array:
-        """``(N - 1,)`` factors of the noise of images between nodes, by the angular rate there."""
-        if self._haste is None or self._haste[0] is not self.nodes:
+    def angular_rate(self) -> Array:
+        """``(N - 1,)`` mean between nodes, rad/s."""
+        if self._turned is None or self._turned[0] is not self.nodes:
             times, stamps = self.nodes.times + self.offset, self.samples.timestamps
             rate = np.linalg.norm(self.samples.gyro - self.gyro_bias, axis=1)
             turned = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(stamps))])
-            rates = np.diff(np.interp(times, stamps, turned)) / np.diff(times)
-            self._haste = self.nodes, 1 + (rates / HASTE) ** 2
-        return self._haste[1]
+            self._turned = self.nodes, np.diff(np.interp(times, stamps, turned)) / np.diff(times)
+        return self._turned[1]
+
+    @property
+    def haste(self) -> Array:
+        """``(N - 1,)`` factors of the noise of images between nodes, by the angular rate there."""
+        return 1 + (self.angular_rate / HASTE) ** 2
+
+    @property
+    def depth(self) -> Array:
+        """``(N - 1,)`` of the scene between nodes; the median of all where samples lead, as errors are theirs then."""
+        found = np.maximum(self.nodes.depth[:-1], self.nodes.depth[1:])
+        return np.full_like(found, np.median(self.nodes.depth)) if self.unit_held else found
+
+    @property
+    def unit_drift(self) -> Array:
+        """``(N - 1,)`` factors of the drift of the unit of the images between nodes."""
+        if self.unit_held:
+            return self.haste
+        moved = np.linalg.norm(np.diff(self.nodes.position, axis=0), axis=1)
+        parallax = moved / (self.depth * np.diff(self.nodes.times))
+        lost = self.angular_rate / (CARRIED * np.maximum(parallax, LEAST_PARALLAX))
+        return self.haste * np.minimum(1 + lost**2, MOST_CARRIED)
 
     def preintegrated(self, values: Values) -> Preintegration:
         """Samples between the nodes, with the present biases and time offset."""
@@ -710,9 +738,9 @@ class _Residuals:
 def _drift_sigma(problem: Smoother) -> Array:
     """``(N - 1, 4)`` deviations of the drift of visual orientation and log scale between nodes."""
     nodes, options = problem.nodes, problem.options
-    scale = options.scale_walk * options.scale_factor
-    walk = np.array([options.rotation_walk * options.rotation_factor] * 3 + [scale])
-    sigma = walk * (np.sqrt(np.diff(nodes.times)) * problem.haste)[:, None]
+    rotation, scale = options.rotation_walk * options.rotation_factor, options.scale_walk * options.scale_factor
+    sigma = np.stack([rotation * problem.haste] * 3 + [scale * problem.unit_drift], -1)
+    sigma *= np.sqrt(np.diff(nodes.times))[:, None]
     sigma[nodes.segment[1:] != nodes.segment[:-1]] = _UNKNOWN
     return sigma
 
@@ -803,12 +831,13 @@ def _displacements(problem: Smoother, values: Values) -> tuple[_Residuals, float
     back = _turn(values.rotation[:-1])
     moved = _apply(back, np.diff(camera, axis=0))
     shrunk = np.exp(-values.scales(segment)[:-1])[:, None]
-    sigma = (np.sqrt(options.variances(np.diff(nodes.times), nodes.depth[segment[:-1]])[1]) * problem.haste)[:, None]
+    depth = problem.depth
+    sigma = (np.sqrt(options.variances(np.diff(nodes.times), depth)[1]) * problem.haste)[:, None]
     # Images tell a turn and a shift sideways apart by parallax alone: where the visual turn is wrong, so is the shift.
     turned = nodes.rotation @ body
     between = _turn(values.rotation[:-1]) @ values.rotation[1:]
     wrong = rotation_vector(_turn(turned[:-1]) @ turned[1:] @ _turn(between))
-    arm = SHIFTED * nodes.depth[segment[:-1], None, None] * skew(body[2])
+    arm = SHIFTED * depth[:, None, None] * skew(body[2])
     residual = (moved * shrunk - seen + _apply(arm, wrong)) / sigma
     across = segment[1:] != segment[:-1]
     residual[across] = 0.0

@@ -284,7 +284,7 @@ def _sign(
     samples: InertialSamples, found: ImuAlignment, timestamps: Array, rotations_wc: Array, positions_wc: Array
 ) -> Found:
     """Sign of all three axes of the accelerometer, by the accelerations of the camera."""
-    none, depth = np.zeros(len(timestamps), int), np.ones(1)
+    none, depth = np.zeros(len(timestamps), int), np.ones(len(timestamps))
     problem = Smoother(
         VisualNodes(timestamps, none, rotations_wc, positions_wc, depth), samples,
         samples.noise or NOISE_PRESETS["phone"], found.rotation_camera_imu, np.zeros(3), gyro_bias=found.gyro_bias,

@@ -237,7 +237,7 @@ class InertialTracking:
             if state is not None:
                 record.inertial = estimate.pose_wc is None
                 return self._bridged(estimate, state)
-        return replace(estimate, scale_state=estimator.state)
+        return replace(estimate, scale_state=estimator.scale_state)
 
     def expressed(self, result: Result) -> Result:
         """Result so far, in metres where that is known; the map itself is not changed.
@@ -490,19 +490,25 @@ class InertialTracking:
         begins = np.diff(chosen_of, prepend=-1) != 0  # a world comes again where a segment was found in it
         segment, worlds = np.cumsum(begins) - 1, chosen_of[begins].tolist()
         rotation, position = split(rows.poses_wc[chosen])
-        depth = np.array([self._depth(world) for world in worlds])
+        depth = self._depths([frames[k] for k in chosen])
         return VisualNodes(times[chosen], segment, rotation, position, depth), worlds
 
-    def _depth(self, world: int) -> float:
-        """Usual depth of the scene in a world."""
-        graph, centre = self.graph, self.graph.window.patches.shape[-1] // 2
-        if len(graph.window) and graph.world_of(graph.segment) == world:
-            inverse = graph.window.patches[:, 2, centre, centre].double().cpu().numpy()
-        else:
-            kept = [frame.inverse_depth for frame in graph.members(world)[-20:]]
-            inverse = np.concatenate(kept).astype(np.float64) if kept else np.ones(1)
-        usual = float(np.median(inverse[inverse > 0])) if (inverse > 0).any() else 1.0
-        return 1 / max(usual, 1e-6)
+    def _depths(self, frames: list[FrameRecord]) -> np.ndarray:
+        """``(N,)`` median depth of the patches of the keyframe that each frame is anchored to."""
+        graph, window, m = self.graph, self.graph.window, self.graph.per_frame
+        centre, anchors = window.patches.shape[-1] // 2, [frame.anchor for frame in frames if frame.anchor is not None]
+        places = {frame.identifier: place for place, frame in enumerate(window.frames)}
+        present = window.patches[:, 2, centre, centre].double().cpu().numpy()
+        usual, found = 1.0, {}
+        for anchor in dict.fromkeys(anchors):
+            if anchor in places:
+                inverse = present[places[anchor] * m : (places[anchor] + 1) * m]
+            else:
+                inverse = graph.archive[anchor].inverse_depth if anchor in graph.archive else present[:0]
+            inverse = inverse[inverse > 0]
+            usual = 1 / max(float(np.median(inverse)), 1e-6) if len(inverse) else usual
+            found[anchor] = usual
+        return np.array([found[anchor] for anchor in anchors])
 
     def _predict(self, time: float) -> BodyState | None:
         """State at a time after the last frame with a pose; None if that is too long ago."""
@@ -535,8 +541,8 @@ class InertialTracking:
             unit = np.diag([scale] * 3 + [1.0] * 3)
             covariance = unit @ covariance @ unit
         return replace(
-            estimate, pose_wc=pose_from(rotation, position), covariance=covariance, scale_state=self.estimator.state,
-            inertial=self._beside(estimate.timestamp, rotation, position),
+            estimate, pose_wc=pose_from(rotation, position), covariance=covariance,
+            scale_state=self.estimator.scale_state, inertial=self._beside(estimate.timestamp, rotation, position),
         )  # fmt: skip
 
     def _bridged(self, estimate: Estimate, state: BodyState) -> Estimate:
@@ -557,7 +563,7 @@ class InertialTracking:
         reason = estimate.reason or "the images have no scale yet"
         return Estimate(
             estimate.timestamp, pose_from(rotation, position), Status.INERTIAL, 0.0, estimate.segment, reason,
-            covariance=own @ grown @ own.T, reference=anchor.time, scale_state=estimator.state,
+            covariance=own @ grown @ own.T, reference=anchor.time, scale_state=estimator.scale_state,
             inertial=InertialEstimate(
                 state.velocity, state.gyro_bias, state.accel_bias, estimator.scale_sigma,
                 camera_covariance(state, turn, estimator.translation_camera_imu), estimator.solution.time_offset,

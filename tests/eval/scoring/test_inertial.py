@@ -90,6 +90,8 @@ def test_nees_is_one_for_errors_of_the_stated_covariance() -> None:
         assert getattr(found, name) == pytest.approx(1, abs=0.2), name
     sure = errors_of(replace(run, covariance=run.covariance / 4), reference, truth)
     assert sure.nees_position == pytest.approx(4 * found.nees_position)
+    doubt = np.where(np.abs(TIMES - 15) < 5, "initialising", "aligned")
+    assert errors_of(replace(run, scale_state=doubt), reference, truth).nees_position == found.nees_position
 
 
 def test_a_segment_in_the_same_world_has_no_origin_of_its_own() -> None:

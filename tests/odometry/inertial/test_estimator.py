@@ -403,7 +403,7 @@ def parts(recording: Recording, spans: list[tuple[float, float]], changes: list[
         np.concatenate([part.segment + k for k, part in enumerate(nodes)]),
         np.concatenate([change.rotation @ part.rotation for part, change in zip(nodes, changes, strict=True)]),
         np.concatenate([change.points(part.position) for part, change in zip(nodes, changes, strict=True)]),
-        np.array([change.scale * part.depth[0] for part, change in zip(nodes, changes, strict=True)]),
+        np.concatenate([change.scale * part.depth for part, change in zip(nodes, changes, strict=True)]),
     )
 
 
@@ -609,26 +609,47 @@ def test_a_clock_that_drifts_is_told_within_seconds_and_for_good(rate: float, is
     assert estimator.aligned == is_used
 
 
-@pytest.mark.parametrize(("sigma", "taken", "failures"), [(0.05, True, 0), (0.15, False, 0), (0.25, False, 1)])
-def test_an_estimate_with_an_unsure_scale_does_not_replace_the_one_before(
-    monkeypatch: pytest.MonkeyPatch, sigma: float, taken: bool, failures: int
-) -> None:
-    recording = record(0, seconds=8.0)
-    estimator = drive(recording, until=6.0)[0]
-    before, solved = estimator.solution, estimator._solved
-    assert estimator.aligned
+def unsure_of_the_scale(monkeypatch: pytest.MonkeyPatch, estimator: InertialEstimator, sigma: float) -> None:
+    """Further estimates of the whole window have this relative deviation of the scale."""
+    solved = InertialEstimator._solved
 
     def unsure(problem: Smoother, worlds: list[int]) -> Smoothed | None:
-        found = solved(problem, worlds)
+        found = solved(estimator, problem, worlds)
         assert found is not None
         covariance = found.covariance.copy()
         covariance[-4, -4] += sigma**2 - found.scale_sigma**2
         return replace(found, covariance=covariance)
 
     monkeypatch.setattr(estimator, "_solved", unsure)
-    estimator.add(recording.samples.between(estimator.stream.end, 7.0))
-    estimator.update(recording.nodes(0.0, 7.0), [0])
-    assert (estimator.solution is not before) == taken and estimator._failures == failures and estimator.aligned
+
+
+def test_a_scale_that_is_unsure_for_now_is_followed_and_not_called_aligned(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = record(0, seconds=10.0)
+    estimator = drive(recording, until=6.0)[0]
+    assert estimator.scale_state is ScaleState.ALIGNED and not estimator.reason
+    for time, sigma, told in ((7.0, 0.08, True), (7.5, 0.15, False), (8.0, 0.08, False), (8.5, 0.04, True)):
+        before = estimator.solution
+        unsure_of_the_scale(monkeypatch, estimator, sigma)
+        estimator.add(recording.samples.between(estimator.stream.end, time))
+        estimator.update(recording.nodes(0.0, time), [0])
+        assert estimator.solution is not before and estimator.aligned
+        assert estimator.scale_state is (ScaleState.ALIGNED if told else ScaleState.INITIALISING)
+        assert told or estimator.reason == f"the scale is uncertain by {100 * sigma:.0f} % for now"
+        assert not told or not estimator.reason
+
+
+def test_a_scale_that_stays_lost_withdraws_the_alignment(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = record(0, seconds=14.0)
+    estimator = drive(recording, until=6.0)[0]
+    estimator.options = replace(estimator.options, longest=4.0)
+    unsure_of_the_scale(monkeypatch, estimator, 0.25)
+    for time in np.arange(7.0, 14.0):
+        estimator.add(recording.samples.between(estimator.stream.end, time))
+        estimator.update(recording.nodes(0.0, time), [0])
+        if not estimator.aligned:
+            break
+    assert 9.5 < time < 11.5  # the scale was known at 6 s
+    assert estimator.reason == "withdrawn: the scale is uncertain by 25 %"
 
 
 def test_two_adjustments_that_agree_align_and_samples_then_lead_the_window() -> None:

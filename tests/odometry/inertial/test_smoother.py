@@ -23,7 +23,10 @@ from tests.support.visual_inertial import CAMERA_IMU, DEPTH, LEVER, OFFSET, SCAL
 
 
 def solved(recording: Recording, end: float) -> smoother.Smoothed:
-    problem = recording.problem(0.1, end)
+    return from_linear_start(recording.problem(0.1, end))
+
+
+def from_linear_start(problem: smoother.Smoother) -> smoother.Smoothed:
     scale, gravity, problem.gyro_bias = linear_start(problem)
     worlds = Similarities(np.array([np.log(scale)]), upright(gravity)[None], np.zeros((1, 3)))
     return smooth(problem, first_values(problem, worlds))
@@ -180,3 +183,38 @@ def test_the_noise_of_images_grows_with_the_square_of_the_angular_rate() -> None
     fast = replace(at_rest, gyro=at_rest.gyro + [0.0, 3 * smoother.HASTE, 0.0])
     assert np.allclose(replace(problem, samples=at_rest).haste, 1.0)
     assert np.allclose(replace(problem, samples=fast).haste, 10.0)
+
+
+def test_the_unit_drifts_faster_where_the_camera_turns_and_sees_little_parallax() -> None:
+    problem = record(3, seconds=4.0).problem(0.5, 2.0)
+    times = problem.nodes.times
+    rate, speed = 0.1, 0.1 / smoother.CARRIED * DEPTH / SCALE  # drifts twice as fast
+    turning = replace(problem.samples, gyro=np.tile([0.0, rate, 0.0], (len(problem.samples), 1)))
+
+    def drift(speed: float, *, held: bool = False) -> np.ndarray:
+        path = np.outer(times, [speed, 0.0, 0.0])
+        moving = replace(problem, samples=turning, nodes=replace(problem.nodes, position=path), unit_held=held)
+        return moving.unit_drift / moving.haste
+
+    assert np.allclose(drift(speed), 2.0)
+    assert np.allclose(drift(speed / 3), 10.0)
+    assert np.allclose(drift(0.0), smoother.MOST_CARRIED)
+    assert np.allclose(drift(0.0, held=True), 1.0)
+
+
+@pytest.mark.parametrize("grade", ["euroc", "phone"])
+def test_a_unit_that_jumps_before_a_far_wall_is_told_by_the_samples(
+    grade: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It doubles within a third of a second, where the scene is far away for the speed of the turn."""
+    recording = record(7, seconds=8.0, grade=grade, walk=2e-3)
+    steps = np.diff(recording.position, axis=0, prepend=recording.position[:1])
+    grown = np.interp(recording.times, [6.0, 6.3], [1.0, 2.0])
+    problem = replace(recording, position=np.cumsum(steps * grown[:, None], axis=0)).problem(0.5, 7.5)
+    depth = problem.nodes.depth * np.where(problem.nodes.times > 5.8, 8.0, 1.0)
+    problem.nodes = replace(problem.nodes, depth=depth)
+    found = from_linear_start(problem)
+    error = abs(found.log_scale[-1] - np.log(SCALE / 2))
+    assert error < 0.05 and error < 3 * found.scale_sigma
+    monkeypatch.setattr(smoother, "CARRIED", 1e9)
+    assert abs(from_linear_start(problem).log_scale[-1] - np.log(SCALE / 2)) > 5 * error

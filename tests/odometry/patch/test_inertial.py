@@ -315,8 +315,28 @@ def test_segments_of_a_world_that_comes_again_are_numbered_in_their_order() -> N
         record.segment = min(k // 4, 2)
     odometry.graph.worlds.update({1: 1, 2: 0})
     nodes, worlds = odometry.inertial._nodes(-np.inf)
-    assert worlds == [0, 1, 0] and len(nodes.depth) == 3
+    assert worlds == [0, 1, 0] and len(nodes.depth) == len(nodes)
     assert (np.diff(nodes.segment) >= 0).all() and np.unique(nodes.segment).tolist() == [0, 1, 2]
+
+
+def test_the_depth_of_a_node_is_that_of_the_keyframe_that_carries_it() -> None:
+    odometry = tracker()
+    for frame in with_samples(frames(16)):
+        odometry.track(frame)
+    graph, window = odometry.graph, odometry.window
+    assert len(graph.archive) and len(window) > 1
+    places = {frame.identifier: place for place, frame in enumerate(window.frames)}
+    for anchor in [frame.anchor for frame in graph.log.frames if frame.anchor is not None]:
+        if anchor in places:
+            patches = window.patches[places[anchor] * graph.per_frame : (places[anchor] + 1) * graph.per_frame]
+            with torch.inference_mode():
+                patches[:, 2] = 1 / (2.0 + anchor)
+        elif not np.allclose(depths := graph.archive[anchor].inverse_depth, 1 / (2.0 + anchor)):
+            graph.archive.set_pose(anchor, graph.archive[anchor].pose_cw, np.full_like(depths, 1 / (2.0 + anchor)))
+    nodes, _ = odometry.inertial._nodes(-np.inf)
+    anchors = [frame.anchor for frame in graph.log.frames if frame.timestamp in set(nodes.times.tolist())]
+    assert len(set(anchors)) > 2
+    assert np.allclose(nodes.depth, 2.0 + np.array(anchors), rtol=1e-5)
 
 
 def test_what_is_missing_at_the_end_is_spread_over_the_time() -> None:

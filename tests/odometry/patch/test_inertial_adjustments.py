@@ -226,13 +226,18 @@ def test_searches_go_on_where_no_adjustment_follows(end: str) -> None:
     assert not odometry.loops.maintenance.awaited
 
 
-def test_the_doubt_of_an_estimate_that_is_not_taken_is_told() -> None:
+def test_a_pose_whose_scale_is_unsure_is_not_called_aligned() -> None:
     odometry = tracker()
     for frame in with_samples(frames(12)):
         odometry.track(frame)
     estimator = odometry.inertial.estimator
     align(odometry, 1.1)
     assert estimator.scale_sigma == pytest.approx(1e-3 * np.sqrt(2), rel=0.01)
-    estimator._untaken = 0.15
+    solution = estimator.solution
+    assert solution is not None
+    covariance = solution.covariance.copy()
+    covariance[-4, -4] = 0.15**2
+    estimator._follow(replace(solution, covariance=covariance))
     told = odometry.track(with_samples(frames(13))[12])
-    assert told.inertial is not None and told.inertial.scale_sigma == 0.15
+    assert told.inertial is not None and told.inertial.scale_sigma == pytest.approx(0.15, rel=0.01)
+    assert told.scale_state is ScaleState.INITIALISING and odometry.inertial.estimator.aligned

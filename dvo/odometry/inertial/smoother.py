@@ -343,9 +343,12 @@ class Smoother:
 
     @property
     def depth(self) -> Array:
-        """``(N - 1,)`` of the scene between nodes; the median of all where samples lead, as errors are theirs then."""
-        found = np.maximum(self.nodes.depth[:-1], self.nodes.depth[1:])
-        return np.full_like(found, np.median(self.nodes.depth)) if self.unit_held else found
+        """``(N - 1,)`` of the scene from each node on; the usual one of its segment where samples lead: errors are theirs."""
+        nodes = self.nodes
+        found = np.maximum(nodes.depth[:-1], nodes.depth[1:])
+        for segment in np.unique(nodes.segment) if self.unit_held else ():
+            found[nodes.segment[:-1] == segment] = np.median(nodes.depth[nodes.segment == segment])
+        return found
 
     @property
     def unit_drift(self) -> Array:

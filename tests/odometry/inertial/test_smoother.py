@@ -202,6 +202,18 @@ def test_the_unit_drifts_faster_where_the_camera_turns_and_sees_little_parallax(
     assert np.allclose(drift(0.0, held=True), 1.0)
 
 
+def test_the_noise_of_displacements_goes_by_the_depth_of_a_node_unless_samples_lead() -> None:
+    problem = record(3, seconds=4.0).problem(0.5, 2.0)
+    count = len(problem.nodes)
+    segment = np.repeat([0, 1], [count - 3, 3])
+    depth = np.where(segment == 1, 50.0, 2.0) + np.arange(count) / count
+    problem.nodes = replace(problem.nodes, segment=segment, depth=depth)
+    assert np.array_equal(problem.depth, depth[1:])
+    problem.unit_held = True
+    usual = [np.median(depth[segment == k]) for k in range(2)]
+    assert np.array_equal(problem.depth, np.repeat(usual, [count - 3, 2]))
+
+
 @pytest.mark.parametrize("grade", ["euroc", "phone"])
 def test_a_unit_that_jumps_before_a_far_wall_is_told_by_the_samples(
     grade: str, monkeypatch: pytest.MonkeyPatch

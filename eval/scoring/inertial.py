@@ -233,8 +233,8 @@ class _Run:
         """Number of alignments that were wrong."""
         times, wrong = self.streamed.timestamps, 0
         for begin, end in _stretches_of(aligned, self.streamed.segment):
-            until = times[end - 1]
-            windows = np.arange(times[begin], max(until - JUDGED, times[begin]) + 1e-9, 1.0)
+            since, until = times[begin] + SPAN / 2, times[end - 1] - SPAN / 2  # displacements within the stretch
+            windows = np.arange(since, max(until - JUDGED, since) + 1e-9, 1.0)
             scales = (pairs.scale(start, min(start + JUDGED, until)) for start in windows)
             off = max((abs(value - 1) for value in scales if math.isfinite(value)), default=0.0)
             tilt = _tilt(self.true_rotation[begin:end], self.rotation[begin:end])

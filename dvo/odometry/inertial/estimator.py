@@ -19,6 +19,7 @@ from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.preintegration import integrated_turn, preintegrate, propagate
 from dvo.odometry.inertial.smoother import (
     GRAVITY,
+    HASTE,
     NODE,
     OPPOSED,
     SHIFT,
@@ -64,8 +65,8 @@ MAX_ERROR = 6.0
 GRAVITY_RANGE = (6.0, 16.0)
 """Median specific force of a camera that is moved by hand, by a vehicle or in flight, m/s^2."""
 MAX_TURN, LAST_TURNS = 1.5, 1.0
-"""Difference of rotations between nodes above which gyroscope and images disagree, degrees: root mean square of all,
-and median of the last seconds."""
+"""Difference of rotations between nodes above which gyroscope and images disagree, degrees at a calm rate: root mean
+square of all, and median of the last seconds."""
 FOUND_EXTRINSIC = 0.02
 """Deviation of a rotation between sensor and camera that was found from the motion, rad."""
 NOISE_RANGE = (0.3, 30.0)
@@ -907,7 +908,10 @@ class InertialEstimator:
         recent = inside & (nodes.times[:-1] >= nodes.times[-1] - LAST_TURNS)
         # the first poses of a segment are the least sure
         settled = nodes.times[-1] - nodes.times[nodes.segment == nodes.segment[-1]][0] > 2 * LAST_TURNS
-        squares = (off**2).sum(-1)
+        # In haste the images are wrong; as fast as both say, or a wrong unit of the gyroscope would excuse itself.
+        seen = np.linalg.norm(rotation_vector(np.swapaxes(turned[:-1], -1, -2) @ turned[1:]), axis=1)
+        haste = 1 + (np.minimum(problem.angular_rate, seen / np.diff(nodes.times)) / HASTE) ** 2
+        squares = (off**2).sum(-1) / haste**2
         angle = float(np.rad2deg(np.sqrt(squares[inside].mean()))) if inside.any() else 0.0
         if settled and recent.any():  # a sensor that has just been hit; images that jump once do not count
             angle = max(angle, float(np.rad2deg(np.sqrt(np.median(squares[recent])))))

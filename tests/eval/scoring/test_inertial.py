@@ -130,6 +130,14 @@ def test_wrong_alignments_are_counted(factor: float, degrees: float, wrong: int)
     assert errors_of(both, reference, truth).wrong_alignments == 2 * wrong
 
 
+def test_displacements_across_an_alignment_do_not_judge_it() -> None:
+    reference, truth = truth_of()
+    poses = reference.poses_wc.copy()
+    poses[TIMES < 12.5, 0] += 10
+    state = np.where((TIMES >= 12.5) & (TIMES < 12.9), "aligned", "initialising")
+    assert errors_of(replace(streamed_of(poses, truth), scale_state=state), reference, truth).wrong_alignments == 0
+
+
 def test_a_few_centimetres_between_rests_tell_no_scale() -> None:
     reference, truth = truth_of()
     poses, rest = reference.poses_wc.copy(), (TIMES > 10) & (TIMES < 20)

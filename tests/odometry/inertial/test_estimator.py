@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from dvo.data.inertial import InertialSamples
+from dvo.data.inertial import NOISE_PRESETS, InertialSamples
 from dvo.geometry.poses import rotation_vector, so3_exp
-from dvo.odometry.inertial.estimator import BodyState, InertialEstimator, Similarity
+from dvo.odometry.inertial.estimator import BodyState, InertialEstimator, Similarity, _DisagreementError
 from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.smoother import (
     GRAVITY,
@@ -607,6 +608,26 @@ def test_a_clock_that_drifts_is_told_within_seconds_and_for_good(rate: float, is
     nodes = recording.nodes(0.0, 14.0)
     assert (estimator.settle(nodes, [0]) is not None) == is_used
     assert estimator.aligned == is_used
+
+
+@pytest.mark.parametrize(
+    ("rate", "unit", "agrees"), [(0.3, 1.0, False), (5.0, 1.0, True), (0.3, 180 / np.pi, False), (5.0, -1.0, False)]
+)
+def test_images_may_turn_differently_in_haste_but_a_wrong_gyroscope_is_told(
+    rate: float, unit: float, agrees: bool
+) -> None:
+    """Orientations by images are wrong by 3 degrees from node to node, or samples have a wrong unit or sign."""
+    times, stamps = np.arange(0.0, 3.0, 0.2), np.arange(-0.1, 3.1, 5e-3)
+    wrong = np.deg2rad(3.0) * np.where(np.arange(len(times)) % 2, 0.5, -0.5)
+    turned = so3_exp(np.outer(rate * times, [0.0, 1.0, 0.0])) @ so3_exp(np.outer(wrong, [1.0, 0.0, 0.0]))
+    gyro, accel = np.tile([0.0, unit * rate, 0.0], (len(stamps), 1)), np.tile([0.0, 9.81, 0.0], (len(stamps), 1))
+    samples = InertialSamples(stamps, gyro, accel, np.array([0.0, 0, 0, 0, 0, 0, 1]), NOISE_PRESETS["euroc"])
+    nodes = VisualNodes(times, np.zeros(len(times), int), turned, np.zeros((len(times), 3)), np.ones(len(times)))
+    noise, none = NOISE_PRESETS["euroc"], np.zeros((len(times), 3))
+    problem = Smoother(nodes, samples, noise, np.eye(3), np.zeros(3))
+    told = nullcontext() if agrees else pytest.raises(_DisagreementError)
+    with told:
+        InertialEstimator._turned_apart(problem, nodes, none, none, 0.0)
 
 
 def unsure_of_the_scale(monkeypatch: pytest.MonkeyPatch, estimator: InertialEstimator, sigma: float) -> None:

@@ -64,9 +64,9 @@ MAX_ERROR = 6.0
 """Mean squared whitened residual above which samples and images do not fit."""
 GRAVITY_RANGE = (6.0, 16.0)
 """Median specific force of a camera that is moved by hand, by a vehicle or in flight, m/s^2."""
-MAX_TURN, LAST_TURNS = 1.5, 1.0
+MAX_TURN, MOST_TURNS, LAST_TURNS = 1.5, 0.9, 1.0
 """Difference of rotations between nodes above which gyroscope and images disagree, degrees at a calm rate: root mean
-square of all, and median of the last seconds."""
+square of most of them, by share, as images fail now and then; and median of the last seconds."""
 FOUND_EXTRINSIC = 0.02
 """Deviation of a rotation between sensor and camera that was found from the motion, rad."""
 NOISE_RANGE = (0.3, 30.0)
@@ -87,8 +87,8 @@ MAX_BIASES = (0.15, 1.0)
 """Biases that no working sensor has, rad/s and m/s^2."""
 AGREEMENT = 0.03
 """Difference of the scales of two estimates in a row that agree, relative, beyond three of their deviations."""
-FAILURES = 3
-"""Estimates in a row that fail the tests, after which an alignment is withdrawn."""
+FAILING = 2.0
+"""Seconds for which all estimates fail the tests, after which an alignment is withdrawn."""
 MOST_PATIENCE = 2.0
 """Seconds from one estimate to the next where all that is known speaks against one."""
 CLOSER = 0.5
@@ -207,7 +207,7 @@ class InertialEstimator:
         self._unsure: tuple[Smoothed, VisualNodes, int] | None = None  # estimate whose scale is not sure, and its world
         self._unsure_since = np.inf  # time of the first of them, since the start or a withdrawal
         self._doubtful, self._known_at = False, -np.inf  # the scale is not known for now; when it was, roughly
-        self._failures, self._patience = 0, AT_FIRST
+        self._failing, self._patience = np.inf, AT_FIRST  # since the first of the last estimates, which all fail
         self._next = self._whole = -np.inf  # times of the next estimate, and of the last one of the whole window
         self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
         self._past: list[BodyState] = []  # states that were newest
@@ -329,7 +329,7 @@ class InertialEstimator:
         if worlds[-1] not in self.worlds or found.scale_sigma <= LOST_SCALE:
             self._known_at = time
         elif not reason and time - self._known_at > self.options.longest:
-            reason, self._failures = f"{_UNCERTAIN} by {100 * found.scale_sigma:.0f} %", FAILURES  # at once
+            reason, self._failing = f"{_UNCERTAIN} by {100 * found.scale_sigma:.0f} %", -np.inf  # at once
         if reason:
             self._refuse(reason, time)
             return
@@ -433,7 +433,7 @@ class InertialEstimator:
         known = Similarities(log_scale, similarity.rotation[None], similarity.translation[None])
         time = float(states.times[-1])
         self.solution = replace(states, log_scale=np.repeat(log_scale, len(states.times)), worlds=known, past=None)
-        self.worlds[world], self._known, self._failures = similarity, [world], 0
+        self.worlds[world], self._known, self._failing = similarity, [world], np.inf
         self._next = self._whole = -np.inf
         self._adjusted = float(log_scale[0]), scale_sigma
         if not self.aligned:
@@ -769,7 +769,7 @@ class InertialEstimator:
         rate, known = 2 * (after - before) / span, 2 * float(np.hypot(sigma, other)) / span
         if abs(rate) - 3 * known > MAX_DRIFT:
             self._drift = f"the clock of the samples drifts by {1000 * rate:.1f} ms a second"
-            self._failures = FAILURES  # at once
+            self._failing = -np.inf  # at once
 
     def _found_offset(self, nodes: VisualNodes) -> float:
         """Time offset by rotations, where they tell another one than an alignment began with; 0 otherwise."""
@@ -912,7 +912,8 @@ class InertialEstimator:
         seen = np.linalg.norm(rotation_vector(np.swapaxes(turned[:-1], -1, -2) @ turned[1:]), axis=1)
         haste = 1 + (np.minimum(problem.angular_rate, seen / np.diff(nodes.times)) / HASTE) ** 2
         squares = (off**2).sum(-1) / haste**2
-        angle = float(np.rad2deg(np.sqrt(squares[inside].mean()))) if inside.any() else 0.0
+        most = np.sort(squares[inside])[: int(np.ceil(MOST_TURNS * inside.sum()))]
+        angle = float(np.rad2deg(np.sqrt(most.mean()))) if inside.any() else 0.0
         if settled and recent.any():  # a sensor that has just been hit; images that jump once do not count
             angle = max(angle, float(np.rad2deg(np.sqrt(np.median(squares[recent])))))
         if angle > MAX_TURN:
@@ -973,16 +974,16 @@ class InertialEstimator:
             self._next = time + self._patience
             self.reason = reason
             return
-        self._failures += 1
-        if self._failures >= FAILURES and not reason.startswith(_WAITING):
+        self._failing = min(self._failing, time)
+        if time - self._failing > FAILING - 1e-6 and not reason.startswith(_WAITING):
             self.history.append({"time": time, "event": "withdrawn", "reason": reason})
             self.state, self.reason = ScaleState.INITIALISING, f"withdrawn: {reason}"
-            self.worlds, self.solution, self._known, self._failures, self._past = {}, None, [], 0, []
+            self.worlds, self.solution, self._known, self._failing, self._past = {}, None, [], np.inf, []
             self._unsure, self._adjusted, self._unsure_since, self._doubtful = None, None, np.inf, False
 
     def _accept(self, found: Smoothed, worlds: list[int], time: float) -> None:
         """Take an estimate that has passed; the first one has to be confirmed by another."""
-        self._failures = 0
+        self._failing = np.inf
         if not self.aligned:
             worlds = worlds[-1:]
             now = float(found.worlds.log_scale[-1]), found.scale_sigma

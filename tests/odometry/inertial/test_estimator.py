@@ -184,6 +184,15 @@ def test_a_rotation_between_sensor_and_camera_that_is_not_stated_is_found() -> N
 
 
 @pytest.mark.long
+def test_frames_that_fail_within_a_moment_withdraw_no_alignment() -> None:
+    estimator = drive(record(0, seconds=7.0), until=6.0)[0]
+    for time in np.arange(6.05, 7.95, 0.05):
+        estimator._refuse("samples and images do not fit", time)
+    assert estimator.aligned
+    estimator._refuse("samples and images do not fit", 8.05)
+    assert not estimator.aligned and estimator.reason == "withdrawn: samples and images do not fit"
+
+
 def test_an_alignment_that_fails_later_is_withdrawn() -> None:
     recording = record(5, seconds=12.0)
     s = recording.samples
@@ -611,14 +620,16 @@ def test_a_clock_that_drifts_is_told_within_seconds_and_for_good(rate: float, is
 
 
 @pytest.mark.parametrize(
-    ("rate", "unit", "agrees"), [(0.3, 1.0, False), (5.0, 1.0, True), (0.3, 180 / np.pi, False), (5.0, -1.0, False)]
+    ("rate", "unit", "steps", "agrees"),
+    [(0.3, 1, 15, False), (0.3, 1, 1, True), (5, 1, 15, True), (0.3, 180 / np.pi, 0, False), (5, -1, 0, False)],
 )
-def test_images_may_turn_differently_in_haste_but_a_wrong_gyroscope_is_told(
-    rate: float, unit: float, agrees: bool
+def test_images_may_turn_differently_in_haste_or_once_but_a_wrong_gyroscope_is_told(
+    rate: float, unit: float, steps: int, agrees: bool
 ) -> None:
-    """Orientations by images are wrong by 3 degrees from node to node, or samples have a wrong unit or sign."""
+    """Some orientations by images are wrong by 3 degrees from node to node, or samples have a wrong unit or sign."""
     times, stamps = np.arange(0.0, 3.0, 0.2), np.arange(-0.1, 3.1, 5e-3)
-    wrong = np.deg2rad(3.0) * np.where(np.arange(len(times)) % 2, 0.5, -0.5)
+    wrong = np.deg2rad(3.0) * (np.arange(len(times)) % 2) * (np.arange(len(times)) < steps + 1)
+    wrong = wrong if steps != 1 else np.deg2rad(20.0) * (np.arange(len(times)) > 3)
     turned = so3_exp(np.outer(rate * times, [0.0, 1.0, 0.0])) @ so3_exp(np.outer(wrong, [1.0, 0.0, 0.0]))
     gyro, accel = np.tile([0.0, unit * rate, 0.0], (len(stamps), 1)), np.tile([0.0, 9.81, 0.0], (len(stamps), 1))
     samples = InertialSamples(stamps, gyro, accel, np.array([0.0, 0, 0, 0, 0, 0, 1]), NOISE_PRESETS["euroc"])

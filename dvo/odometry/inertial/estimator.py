@@ -224,7 +224,8 @@ class InertialEstimator:
     @property
     def scale_state(self) -> ScaleState:
         """What is known of the present scale."""
-        return ScaleState.INITIALISING if self.aligned and self._doubtful else self.state
+        in_doubt = self._doubtful or self._failing < np.inf
+        return ScaleState.INITIALISING if self.aligned and in_doubt else self.state
 
     @property
     def holds_unit(self) -> bool:
@@ -658,7 +659,7 @@ class InertialEstimator:
                 {"time": self._aligned, "event": "aligned at the end", "scale_sigma": sigma or found.scale_sigma}
             )
         self._take(found, worlds)
-        self._doubtful, self.reason = False, ""  # that was of the newest poses
+        self._doubtful, self._failing, self.reason = False, np.inf, ""  # that was of the newest poses
         return found
 
     # ------------------------------------------------------------------------------------------------------------------
@@ -974,8 +975,10 @@ class InertialEstimator:
             self._next = time + self._patience
             self.reason = reason
             return
-        self._failing = min(self._failing, time)
-        if time - self._failing > FAILING - 1e-6 and not reason.startswith(_WAITING):
+        if reason.startswith(_WAITING):
+            return
+        self._failing, self.reason = min(self._failing, time), reason
+        if time - self._failing > FAILING - 1e-6:
             self.history.append({"time": time, "event": "withdrawn", "reason": reason})
             self.state, self.reason = ScaleState.INITIALISING, f"withdrawn: {reason}"
             self.worlds, self.solution, self._known, self._failing, self._past = {}, None, [], np.inf, []
@@ -1001,6 +1004,7 @@ class InertialEstimator:
             self._take(found, worlds)
         elif found.scale_sigma < NOTHING_TOLD:  # a new segment, whose scale is not sure yet
             self.solution, self._known = found, list(worlds[: len(found.worlds.log_scale)])
+            self._tell()
         if time - self._aligned >= REFINED_AFTER:
             self.state = ScaleState.REFINED
 

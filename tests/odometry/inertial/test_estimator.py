@@ -188,7 +188,8 @@ def test_frames_that_fail_within_a_moment_withdraw_no_alignment() -> None:
     estimator = drive(record(0, seconds=7.0), until=6.0)[0]
     for time in np.arange(6.05, 7.95, 0.05):
         estimator._refuse("samples and images do not fit", time)
-    assert estimator.aligned
+    assert estimator.aligned and estimator.scale_state is ScaleState.INITIALISING
+    assert estimator.reason == "samples and images do not fit"
     estimator._refuse("samples and images do not fit", 8.05)
     assert not estimator.aligned and estimator.reason == "withdrawn: samples and images do not fit"
 

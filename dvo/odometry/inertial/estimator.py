@@ -184,7 +184,7 @@ class InertialEstimator:
 
     Attributes:
         state: what is known.
-        reason: why there is no alignment (yet), or why one was withdrawn; empty otherwise.
+        reason: why there is no alignment (yet), why one was withdrawn or is in doubt; empty otherwise.
         worlds: similarity by the number of the world of visual poses, of those that are aligned.
         stream: samples.
         solution: newest estimate that passed the tests; None before it.
@@ -1013,7 +1013,10 @@ class InertialEstimator:
         if not self.aligned:
             return
         self._doubtful = self.scale_sigma > (SURE_SCALE if self._doubtful else UNSURE_SCALE)
-        self.reason = f"{_UNCERTAIN} by {100 * self.scale_sigma:.0f} % for now" if self._doubtful else ""
+        if self._doubtful:
+            self.reason = f"{_UNCERTAIN} by {100 * self.scale_sigma:.0f} % for now"
+        elif self._failing == np.inf:
+            self.reason = ""
 
     def _take(self, found: Smoothed, worlds: list[int]) -> None:
         """Let poses follow an estimate."""

@@ -189,7 +189,9 @@ def test_frames_that_fail_within_a_moment_withdraw_no_alignment() -> None:
     for time in np.arange(6.05, 7.95, 0.05):
         estimator._refuse("samples and images do not fit", time)
     assert estimator.aligned and estimator.scale_state is ScaleState.INITIALISING
-    assert estimator.reason == "samples and images do not fit"
+    assert (solution := estimator.solution) is not None
+    estimator._follow(solution)  # an estimate that goes on from one before
+    assert estimator.reason == "samples and images do not fit" and estimator.scale_state is ScaleState.INITIALISING
     estimator._refuse("samples and images do not fit", 8.05)
     assert not estimator.aligned and estimator.reason == "withdrawn: samples and images do not fit"
 

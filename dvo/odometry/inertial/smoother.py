@@ -47,8 +47,8 @@ little that is seen for long."""
 CARRIED, MOST_CARRIED = 15.0, 30.0
 """Angular rate over the rate of parallax (speed over depth of the scene) at which the unit that images carry from what
 leaves the view to what enters it drifts twice as fast as at rest, and then with its square; and factor at most."""
-LEAST_PARALLAX = 1e-3
-"""Rate of parallax, rad/s, below which it is noise."""
+LEAST_PARALLAX = 1e-2
+"""Rate of parallax, rad/s, below which it is noise: a camera at rest keeps its view, and with it the unit."""
 USUAL = 10.0
 """Measurements that the usual noise of visual poses counts for, where it is estimated."""
 OPPOSED = -0.5

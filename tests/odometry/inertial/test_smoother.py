@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dvo.data.inertial import InertialSamples
 from dvo.geometry.poses import so3_exp
 from dvo.odometry.inertial import smoother
 from dvo.odometry.inertial.smoother import (
@@ -188,18 +189,20 @@ def test_the_noise_of_images_grows_with_the_square_of_the_angular_rate() -> None
 def test_the_unit_drifts_faster_where_the_camera_turns_and_sees_little_parallax() -> None:
     problem = record(3, seconds=4.0).problem(0.5, 2.0)
     times = problem.nodes.times
-    rate, speed = 0.1, 0.1 / smoother.CARRIED * DEPTH / SCALE  # drifts twice as fast
+    rate, speed = 1.0, 1.0 / smoother.CARRIED * DEPTH / SCALE  # drifts twice as fast
     turning = replace(problem.samples, gyro=np.tile([0.0, rate, 0.0], (len(problem.samples), 1)))
 
-    def drift(speed: float, *, held: bool = False) -> np.ndarray:
+    def drift(speed: float, *, samples: InertialSamples = turning, held: bool = False) -> np.ndarray:
         path = np.outer(times, [speed, 0.0, 0.0])
-        moving = replace(problem, samples=turning, nodes=replace(problem.nodes, position=path), unit_held=held)
+        moving = replace(problem, samples=samples, nodes=replace(problem.nodes, position=path), unit_held=held)
         return moving.unit_drift / moving.haste
 
     assert np.allclose(drift(speed), 2.0)
     assert np.allclose(drift(speed / 3), 10.0)
     assert np.allclose(drift(0.0), smoother.MOST_CARRIED)
     assert np.allclose(drift(0.0, held=True), 1.0)
+    noise = np.random.default_rng(0).normal(0, 0.025, turning.gyro.shape)  # of a phone
+    assert drift(0.0, samples=replace(turning, gyro=noise)).max() < 1.2
 
 
 def test_the_noise_of_displacements_goes_by_the_depth_of_a_node_unless_samples_lead() -> None:

@@ -343,7 +343,7 @@ class Smoother:
 
     @property
     def depth(self) -> Array:
-        """``(N - 1,)`` of the scene between nodes; the usual one of a segment where samples lead, which err alike."""
+        """``(N - 1,)`` of the scene between nodes; the median of the segment where samples hold the unit."""
         nodes = self.nodes
         found = np.maximum(nodes.depth[:-1], nodes.depth[1:])
         for segment in np.unique(nodes.segment) if self.unit_held else ():

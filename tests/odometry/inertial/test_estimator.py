@@ -183,7 +183,6 @@ def test_a_rotation_between_sensor_and_camera_that_is_not_stated_is_found() -> N
     assert estimator.worlds[0].scale == pytest.approx(SCALE, rel=0.06)  # the lever arm is not known
 
 
-@pytest.mark.long
 def test_frames_that_fail_within_a_moment_withdraw_no_alignment() -> None:
     estimator = drive(record(0, seconds=7.0), until=6.0)[0]
     for time in np.arange(6.05, 7.95, 0.05):
@@ -196,6 +195,7 @@ def test_frames_that_fail_within_a_moment_withdraw_no_alignment() -> None:
     assert not estimator.aligned and estimator.reason == "withdrawn: samples and images do not fit"
 
 
+@pytest.mark.long
 def test_an_alignment_that_fails_later_is_withdrawn() -> None:
     recording = record(5, seconds=12.0)
     s = recording.samples

@@ -90,6 +90,16 @@ def full_precision(device: torch.device) -> Iterator[None]:
             setattr(matmul, name, before)
 
 
+def multiplies_bfloat16(device: torch.device) -> bool:
+    """Tell if a device is a CPU with units for matrix products of bfloat16, which are several times as fast there.
+
+    Args:
+        device: any.
+    """
+    units = getattr(torch.cpu, "_is_amx_tile_supported", None)  # torch 2.6 and newer
+    return device.type == "cpu" and units is not None and bool(units())
+
+
 _forks = {"work": False, "after work": False}  # several threads have computed; this process was forked after that
 
 

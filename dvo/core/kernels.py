@@ -28,25 +28,27 @@ CHOICES = ("numba", "torch")
 _IMPORTING = threading.Lock()
 
 
-def use_kernels(*tensors: Tensor, double: bool = False, adjoint: bool = False) -> bool:
+def use_kernels(*tensors: Tensor, double: bool = False, half: bool = False, adjoint: bool = False) -> bool:
     """Tell if a computation on these tensors is one for kernels.
 
     Args:
         tensors: the floating-point arguments.
         double: the kernels take float64 as well.
+        half: the kernels take bfloat16 as well.
         adjoint: first derivatives have kernels too, hence autograd may record.
 
     Returns:
-        True for float32 tensors (or float64, where these are taken) on the CPU of which no derivative is recorded, by
-        autograd (unless ``adjoint``), as dual numbers or within ``torch.func``, if kernels are there and wanted; False
-        while operations are traced, for ONNX.
+        True for float32 tensors (or float64 or bfloat16, where these are taken) on the CPU of which no derivative is
+        recorded, by autograd (unless ``adjoint``), as dual numbers or within ``torch.func``, if kernels are there and
+        wanted; False while operations are traced, for ONNX.
 
     Raises:
         DvoError: ``DVO_KERNELS`` has another value than ``numba`` or ``torch``.
     """
     if not available() or is_transformed() or forward_ad._current_level >= 0 or torch.jit.is_tracing():
         return False
-    dtype = torch.float64 if double and any(x.dtype == torch.float64 for x in tensors) else torch.float32
+    wider = (torch.float64,) * double + (torch.bfloat16,) * half
+    dtype = next((x.dtype for x in tensors if x.dtype in wider), torch.float32)
     plain = all(type(x) is Tensor and x.device.type == "cpu" and x.dtype == dtype for x in tensors)
     return plain and (adjoint or not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors)))
 

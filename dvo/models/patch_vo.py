@@ -7,6 +7,7 @@ adjustment of the revised flow.
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 from collections.abc import Iterator
 from functools import partial
@@ -26,7 +27,7 @@ from dvo.nets.patch.config import PRESETS, ModelConfig
 from dvo.nets.patch.frame_encoder import FrameEncoder
 from dvo.nets.patch.patchifier import Patchifier, normalise_images, patch_coordinates
 from dvo.nets.patch.selection import SELECTIONS, PatchSelection
-from dvo.nets.update.update import UPDATE_OPERATORS
+from dvo.nets.update.update import UPDATE_OPERATORS, Update
 
 __all__ = ["Mode", "PatchVO", "UpdateState"]
 
@@ -79,6 +80,27 @@ class PatchVO(nn.Module):
         """
         select: PatchSelection = SELECTIONS.resolve(name or self.config.selection)
         return select
+
+    @torch.inference_mode(False)
+    def in_bfloat16(self) -> PatchVO:
+        """Copy for inference that multiplies in bfloat16, several times as fast on processors that have units for it.
+
+        Inputs and outputs are float32, as are correlation, bundle adjustment and update operators of other kinds than
+        the gated one.
+
+        Returns:
+            The copy, in evaluation mode; parameters are rounded.
+
+        Example:
+            >>> model = PatchVO(preset("tiny")).in_bfloat16()
+            >>> model.patchify.encode(torch.zeros(1, 1, 3, 96, 128)).matching.dtype
+            torch.float32
+        """
+        model = copy.deepcopy(self).eval().requires_grad_(False)
+        model.patchify.bfloat16()
+        if isinstance(model.update, Update):
+            model.update.bfloat16()
+        return model
 
     def forward(
         self,

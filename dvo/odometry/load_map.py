@@ -182,6 +182,6 @@ def _read_places(source: MapReader, odometry: PatchOdometry, segments: tuple[int
     except DvoError as error:
         raise source.refused(error.message, "places/descriptors") from error
     with torch.inference_mode():
-        take_places(finder, odometry.model, segments, odometry.device)
+        take_places(finder, odometry.network, segments, odometry.device)
     known = np.isin(finder.places.identifiers, finder.kept).all()
     source.require(known, "keyframes that are not there", "places/identifiers")

@@ -31,10 +31,11 @@ def normalise(
         skip: of the same shape; None: none.
     """
     given = (x,) if skip is None else (x, skip)
-    if isinstance(norm, nn.InstanceNorm2d) and use_kernels(*given) and all(map(_has_channels_last, given)):
+    if isinstance(norm, nn.InstanceNorm2d) and use_kernels(*given, half=True) and all(map(_has_channels_last, given)):
         from dvo.nets.patch import encoder_kernels
 
-        pixels, *beside = (one.permute(0, 2, 3, 1).flatten(1, 2).numpy() for one in given)
+        bits = (one.view(torch.uint16) if one.dtype == torch.bfloat16 else one for one in given)
+        pixels, *beside = (one.permute(0, 2, 3, 1).flatten(1, 2).numpy() for one in bits)
         encoder_kernels.normalise(pixels, norm.eps, rectified, beside[0] if beside else pixels[:0])
         return x
     x = norm(x)
@@ -160,6 +161,7 @@ class Encoder(_StrideFour):
         if use_kernels(images) and not records:
             # Convolutions are faster in this order, and keep it if all strides are those of a copy.
             images = torch.empty_like(images, memory_format=torch.channels_last).copy_(images)
+        images = images.to(self.conv1.weight.dtype)
         return self.layer1(normalise(self.conv1(images), self.norm1))
 
     def trunk(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n t h w"]:
@@ -249,7 +251,7 @@ class LightEncoder(_StrideFour):
         """Layer at half of the image resolution, see :meth:`Encoder.stem`."""
         if self.standardised:
             images = torch.cat([standardise_whole(images), local_contrast(images)], 1)
-        return F.relu(self.conv1(images))
+        return F.relu(self.conv1(images.to(self.conv1.weight.dtype)))
 
     def trunk(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n t h w"]:
         """See :meth:`_StrideFour.trunk`."""

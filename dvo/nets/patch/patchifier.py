@@ -96,7 +96,7 @@ class Patchifier(nn.Module):
         trunk = self.fnet.trunk(flat)
         weight, bias = self.fnet.head(slice(self.config.feature_channels))
         matching = torch.matmul(weight / 4.0, trunk.flatten(2)) + (bias / 4.0)[:, None]
-        matching = matching.unflatten(2, trunk.shape[-2:])
+        matching = matching.unflatten(2, trunk.shape[-2:]).to(images.dtype)
         if not self.config.shared_encoder:
             trunk = self.inet.trunk(flat)
         return Features(matching.unflatten(0, (b, n)), trunk.unflatten(0, (b, n)))
@@ -117,7 +117,7 @@ class Patchifier(nn.Module):
             weight, bias = self.fnet.head(slice(self.config.feature_channels, None))
         else:
             weight, bias = self.inet.head(slice(None))
-        return matching, F.linear(trunk, weight, bias) / 4.0
+        return matching, F.linear(trunk, weight, bias).to(matching.dtype) / 4.0
 
 
 def patch_coordinates(centres: Tensor, inverse_depth: Tensor, size: int) -> Float[Tensor, "B K 3 p p"]:

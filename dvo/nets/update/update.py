@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from functools import partial
 from typing import Any, Protocol
+from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
@@ -168,17 +169,41 @@ def first_layer(layer: nn.Linear, correlation: Correlation, taps: int) -> Tensor
         ``(B, E, D)``.
     """
     levels = correlation.levels
-    table = layer.weight.unflatten(1, (-1, len(levels)))
-    if correlation.order == "pixels_first":
-        table = table.unflatten(1, (taps, taps, -1)).permute(0, 3, 2, 1, 4).flatten(1, 3)
-    weights = table.unbind(-1)
+    weights = _weights_of_levels(layer, correlation, taps)
     learn = correlation.learn
     plain = learn is None or is_transformed() or torch.is_autocast_enabled(learn.device.type)
     linear = functional.linear if plain else partial(_Learnt.apply, learn)
-    out: Tensor = linear(levels[0], weights[0], layer.bias)
+    out: Tensor = linear(levels[0].to(layer.weight.dtype), weights[0], layer.bias)
     for level, weight in zip(levels[1:], weights[1:], strict=True):
-        out = out + linear(level, weight, None)
+        out = out + linear(level.to(layer.weight.dtype), weight, None)
     return out
+
+
+_ORDERED: WeakKeyDictionary[nn.Linear, tuple[tuple[int | str, ...], tuple[Tensor, ...]]] = WeakKeyDictionary()
+"""Weights of first layers in the order of a correlation, with what they were made from: copying them in each step of a
+tracker takes as long as multiplying by them."""
+
+
+def _weights_of_levels(layer: nn.Linear, correlation: Correlation, taps: int) -> tuple[Tensor, ...]:
+    """Weights of a first layer for each level."""
+    weight, count = layer.weight, len(correlation.levels)
+    records = torch.is_grad_enabled() and weight.requires_grad
+    if records or is_transformed() or torch.jit.is_tracing():
+        return _ordered(weight, count, correlation.order, taps)
+    version = 0 if weight.is_inference() else weight._version
+    made_of = weight.data_ptr(), version, count, correlation.order
+    found = _ORDERED.get(layer)
+    if found is None or found[0] != made_of:
+        found = made_of, tuple(x.contiguous() for x in _ordered(weight, count, correlation.order, taps))
+        _ORDERED[layer] = found
+    return found[1]
+
+
+def _ordered(weight: Tensor, levels: int, order: str, taps: int) -> tuple[Tensor, ...]:
+    table = weight.unflatten(1, (-1, levels))
+    if order == "pixels_first":
+        table = table.unflatten(1, (taps, taps, -1)).permute(0, 3, 2, 1, 4).flatten(1, 3)
+    return table.unbind(-1)
 
 
 class _Learnt(torch.autograd.Function):
@@ -287,11 +312,15 @@ class Update(nn.Module):
         Returns:
             New state ``(B, E, D)``, flow revision ``(B, E, 2)`` in feature pixels, confidence ``(B, E, 2)`` in (0, 1).
         """
-        net = self.norm(hidden + context + encode_correlation(self.corr, correlation, self.taps))
+        dtype = self.norm.weight.dtype
+        state, has_previous, has_following = (
+            x.to(dtype) for x in (hidden + context, graph.has_previous, graph.has_following)
+        )
+        net = self.norm(state + encode_correlation(self.corr, correlation, self.taps))
         # The mask multiplies the input, so an edge without a neighbour still receives c(0) (as DPVO's weights expect).
-        net = net + self.c1(net.index_select(1, graph.previous) * graph.has_previous)
-        net = net + self.c2(net.index_select(1, graph.following) * graph.has_following)
+        net = net + self.c1(net.index_select(1, graph.previous) * has_previous)
+        net = net + self.c2(net.index_select(1, graph.following) * has_following)
         net = net + self.agg_kk(net, graph.by_patch)
         net = net + self.agg_ij(net, graph.by_pair)
         net = self.gru(net)
-        return net, self.d(net), self.w(net)
+        return net.to(hidden.dtype), self.d(net).to(hidden.dtype), self.w(net).to(hidden.dtype)

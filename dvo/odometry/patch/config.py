@@ -28,6 +28,8 @@ C = TypeVar("C", bound="DataclassInstance")
 
 Policy = Literal["continuous", "retry", "late", "located"]
 """What a frame follows that is tried in the window."""
+Precision = Literal["auto", "float32", "bfloat16"]
+"""Type of the numbers that the network multiplies; ``auto``: bfloat16 on a CPU with units for it (Intel's AMX)."""
 InitialPose = Literal["motion", "nearest"]
 """First pose of a new frame: of the motion model, or from matches with the newest keyframe."""
 
@@ -133,6 +135,8 @@ class TrackerConfig:
         scale: observation that metres come from, none for a trajectory up to scale; a table of its values will do.
         inertial: use of inertial samples that frames bring, a :class:`dvo.odometry.inertial.options.InertialOptions`; a
             table of its values will do.
+        precision: see :data:`Precision` (:meth:`dvo.models.patch_vo.PatchVO.in_bfloat16`). All else is computed in
+            float32 and float64.
         sensors: names of others whose measurements take part in every step of an initialised window
             (:data:`dvo.odometry.window.sensors.WINDOW_SENSORS`), with commas between or as a list.
 
@@ -185,6 +189,7 @@ class TrackerConfig:
     max_gap: float = 4.5
     scale: ScaleOptions = ScaleOptions()  # noqa: RUF009 (frozen)
     inertial: InertialOptions = InertialOptions()  # noqa: RUF009 (frozen)
+    precision: Precision = "auto"
     sensors: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dvo.core.arguments import checked_arguments
-from dvo.core.context import core_left
+from dvo.core.context import core_left, multiplies_bfloat16
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.inertial import InertialSamples
@@ -88,6 +88,8 @@ class PatchOdometry:
         weights: name or file of the network, by which :func:`dvo.load_map` finds it again.
 
     Attributes:
+        model: the network as it was given.
+        network: the same in the precision that it tracks with.
         gate: that every frame has to pass.
         graph: window, archive and log of frames.
         state: all else that a frame changes.
@@ -114,6 +116,8 @@ class PatchOdometry:
         self.name, self.config, self.seed, self.weights = name, config, seed, weights
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
+        half = config.precision == "bfloat16" or config.precision == "auto" and multiplies_bfloat16(self.device)
+        self.network = self.model.in_bfloat16() if half else self.model
         self.archive = archive
         if self.device.type == "cpu":
             load_in_background()
@@ -129,19 +133,19 @@ class PatchOdometry:
         sizes = config.patches, c.patch_size, c.hidden_channels
         self.graph = KeyframeGraph(*sizes, self.device, self.archive, lambda edges: self.patch_window.finalise(edges))
         self.sensors: list[WindowSensor] = [
-            WINDOW_SENSORS.resolve(name)(self.model, self.device) for name in config.sensors
+            WINDOW_SENSORS.resolve(name)(self.network, self.device) for name in config.sensors
         ]
         self.inertial = InertialTracking(
             config.inertial, self.graph, metric=config.scale.source != "none", variance=config.variance,
             optimised=config.optimisation,
         )  # fmt: skip
-        self.patch_window = PatchWindow(self.model, self.window, config.measuring, self.device, self.sensors)
+        self.patch_window = PatchWindow(self.network, self.window, config.measuring, self.device, self.sensors)
         self.aligner: FrameAlignment | None = None
         if config.aligned_motion > 0 and not self.sensors:
             self.aligner = FrameAlignment(
                 self.patch_window, config.alignment, config.motion_damping, config.aligned_motion
             )
-        self.loops = loop_closer(self.model, config, self.graph, self.device, self.state, self.inertial.corrected)
+        self.loops = loop_closer(self.network, config, self.graph, self.device, self.state, self.inertial.corrected)
 
     @property
     def window(self) -> Window:
@@ -239,9 +243,9 @@ class PatchOdometry:
             return estimate
         if self.aligner is not None:
             self.aligner.age = 0
-        seen = observe(self.model, image, admitted.camera, self.select, self.device, mask=mask)
+        seen = observe(self.network, image, admitted.camera, self.select, self.device, mask=mask)
         if self.config.scale.depth or self.config.scale.stereo:
-            seen = measure_depth(self.model, seen, admitted.frame, self.config.scale, self.config.measuring)
+            seen = measure_depth(self.network, seen, admitted.frame, self.config.scale, self.config.measuring)
         state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
         state.checks.see(len(self.graph.log.frames) - 1, image, seen.image_intrinsics, mask)
         estimate = self._take(View([record], seen))

@@ -20,6 +20,7 @@ from numba.extending import intrinsic
 from dvo.core.compiled import compiled, part
 
 _WIDTH = 8
+_CHANNELS = 64  # of the features of the default network
 _VECTOR = ir.VectorType(ir.FloatType(), _WIDTH)
 # Lanes of two vectors, side by side, whose sums are those of pairs of lanes, for each of three foldings.
 _FOLDINGS = (
@@ -29,12 +30,14 @@ _FOLDINGS = (
 )
 
 
-@intrinsic
-def _eight_products(context, maps, first, feature, out, position):
+@intrinsic(prefer_literal=True)
+def _eight_products(context, maps, first, feature, channels, out, position):
     """Store at ``position`` of ``out`` the dot products of a feature with eight pixels from ``first`` of flat maps.
 
-    All arrays are contiguous and of float32; the channels are a multiple of eight.
+    All arrays are contiguous and of float32; the channels are a multiple of eight. If their number is a literal, the
+    addresses of the pixels are constants.
     """
+    known = channels.literal_value if isinstance(channels, types.IntegerLiteral) else None
 
     def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
         def array(k: int) -> Any:
@@ -43,7 +46,7 @@ def _eight_products(context, maps, first, feature, out, position):
         def vector(pointer: Any) -> Any:
             return builder.bitcast(pointer, _VECTOR.as_pointer())
 
-        channels = builder.extract_value(array(2).shape, 0)
+        channels = given[3] if known is None else ir.Constant(given[1].type, known)
         start = builder.gep(array(0).data, [given[1]])
         entry, loop, end = builder.block, builder.append_basic_block(), builder.append_basic_block()
         builder.branch(loop)
@@ -71,10 +74,10 @@ def _eight_products(context, maps, first, feature, out, position):
                 builder.fadd(builder.shuffle_vector(a, b, one), builder.shuffle_vector(a, b, other))
                 for a, b in zip(after[::2], after[1::2], strict=True)
             ]
-        builder.store(after[0], vector(builder.gep(array(3).data, [given[4]])), align=4)
+        builder.store(after[0], vector(builder.gep(array(4).data, [given[5]])), align=4)
         return target.get_dummy_value()
 
-    return types.void(maps, types.intp, feature, out, types.intp), generate
+    return types.void(maps, types.intp, feature, types.intp if known is None else channels, out, types.intp), generate
 
 
 @intrinsic
@@ -135,7 +138,10 @@ def _products(maps, first, stride, feature, out):
         for row in range(taps):
             for left in range(0, taps, _WIDTH):
                 at = first + row * stride + left * channels
-                _eight_products(maps, at, feature, flat, row * taps + left)  # type: ignore[call-arg]
+                if channels == _CHANNELS:
+                    _eight_products(maps, at, feature, _CHANNELS, flat, row * taps + left)  # type: ignore[call-arg]
+                else:
+                    _eight_products(maps, at, feature, channels, flat, row * taps + left)  # type: ignore[call-arg]
         return
     for row in range(taps):
         for column in range(taps):
@@ -202,6 +208,21 @@ def _take_back_blend(grad, fx, fy, weights):
             weights[i + 1, j + 1] += fy * right
 
 
+@part
+def _by_frame(frames, count):
+    """Edges in the order of their frames, so that a map is read from a near cache."""
+    begins = np.zeros(count + 1, np.intp)
+    for frame in frames:
+        begins[frame + 1] += 1
+    for frame in range(count):
+        begins[frame + 1] += begins[frame]
+    order = np.empty(len(frames), np.intp)
+    for edge in range(len(frames)):
+        order[begins[frames[edge]]] = edge
+        begins[frames[edge]] += 1
+    return order
+
+
 @compiled
 def correlate(maps, features, at, kk, frames, radius, out):
     """Fill ``out (E, q, 2r+1, 2r+1)``; the other arguments are those of the twin, maps and features contiguous."""
@@ -209,7 +230,7 @@ def correlate(maps, features, at, kk, frames, radius, out):
     _, height, width, channels = maps.shape
     flat = maps.reshape(-1)
     products = np.empty((taps, taps), np.float32)
-    for edge in range(len(at)):
+    for edge in _by_frame(frames, len(maps)):
         for pixel in range(at.shape[1]):
             x, y = at[edge, pixel, 0], at[edge, pixel, 1]
             if math.isnan(x) or math.isnan(y):

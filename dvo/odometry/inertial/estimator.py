@@ -110,6 +110,8 @@ LEAD = 0.03
 """Seconds of samples beyond the nodes, by which a time offset that is not known yet may change."""
 LONGEST_GAP = 0.02
 """Between samples that tell a rotation within a readout, seconds."""
+SILENT = 1.0
+"""Seconds without samples after which a scale is in doubt: the unit of the images drifts unseen."""
 STILL = (0.02, 0.15)
 """Standard deviations of rates (rad/s) and forces (m/s^2) over :data:`STILL_FOR` of a sensor that stands still."""
 STILL_FOR = 0.4
@@ -207,6 +209,7 @@ class InertialEstimator:
         self._unsure: tuple[Smoothed, VisualNodes, int] | None = None  # estimate whose scale is not sure, and its world
         self._unsure_since = np.inf  # time of the first of them, since the start or a withdrawal
         self._doubtful, self._known_at = False, -np.inf  # the scale is not known for now; when it was, roughly
+        self._silent = False  # samples are missing
         self._failing, self._patience = np.inf, AT_FIRST  # since the first of the last estimates, which all fail
         self._next = self._whole = -np.inf  # times of the next estimate, and of the last one of the whole window
         self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
@@ -224,7 +227,7 @@ class InertialEstimator:
     @property
     def scale_state(self) -> ScaleState:
         """What is known of the present scale."""
-        in_doubt = self._doubtful or self._failing < np.inf
+        in_doubt = self._doubtful or self._silent or self._failing < np.inf
         return ScaleState.INITIALISING if self.aligned and in_doubt else self.state
 
     @property
@@ -279,6 +282,7 @@ class InertialEstimator:
             nodes: gives the visual poses from a time on, and the world of each of their segments.
             moved: by more than a little; once it is aligned, a frame that has not needs no estimate.
         """
+        self._listen(time)
         if self.state is ScaleState.NONE or time < self._next:
             return
         past = self.solution.past if self.solution is not None and self.aligned else None
@@ -298,6 +302,7 @@ class InertialEstimator:
             return
         self._unsure = None
         time = self._whole = float(nodes.times[-1])
+        self._listen(time)
         self._next = time + (EVERY if self.aligned else AT_FIRST)
         if self.solution is not None:  # the window begins with a node that is known
             known = np.isin(np.round(nodes.times, 6), np.round(self.solution.times, 6))
@@ -1008,6 +1013,14 @@ class InertialEstimator:
         if time - self._aligned >= REFINED_AFTER:
             self.state = ScaleState.REFINED
 
+    def _listen(self, time: float) -> None:
+        """Note if samples are missing at the time of a frame."""
+        offset = self.first_offset if self.solution is None else self.solution.time_offset
+        late = time + offset - self.stream.end
+        self._silent = self.aligned and late > SILENT
+        if self._silent:
+            self.reason = f"no samples for {late:.0f} s"
+
     def _tell(self) -> None:
         """Note if the present scale is known."""
         if not self.aligned:
@@ -1015,7 +1028,7 @@ class InertialEstimator:
         self._doubtful = self.scale_sigma > (SURE_SCALE if self._doubtful else UNSURE_SCALE)
         if self._doubtful:
             self.reason = f"{_UNCERTAIN} by {100 * self.scale_sigma:.0f} % for now"
-        elif self._failing == np.inf:
+        elif self._failing == np.inf and not self._silent:
             self.reason = ""
 
     def _take(self, found: Smoothed, worlds: list[int]) -> None:

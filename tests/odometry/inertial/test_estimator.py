@@ -673,6 +673,22 @@ def test_a_scale_that_is_unsure_for_now_is_followed_and_not_called_aligned(monke
         assert not told or not estimator.reason
 
 
+@pytest.mark.parametrize("late", [True, False])
+def test_a_scale_is_in_doubt_while_samples_are_missing(late: bool) -> None:
+    """They come late, or never."""
+    recording = record(0, seconds=11.0)
+    estimator = drive(recording, until=6.0)[0]
+    for time in recording.times[(recording.times > 6.0) & (recording.times < 9.0)]:
+        estimator.refresh(time, lambda since, time=time: (recording.nodes(since, time), [0]))
+        assert estimator.aligned and (estimator.scale_state is ScaleState.ALIGNED) == (time < estimator.stream.end + 1)
+    assert estimator.reason == "no samples for 3 s"
+    estimator.add(recording.samples.between(6.0 if late else 9.0, 9.0 + 1e-3))
+    for time in recording.times[recording.times >= 9.0]:
+        feed(estimator, recording, time)
+    assert estimator.scale_state is ScaleState.ALIGNED and not estimator.reason
+    assert estimator.worlds[0].scale == pytest.approx(SCALE, rel=0.05)
+
+
 def test_a_scale_that_stays_lost_withdraws_the_alignment(monkeypatch: pytest.MonkeyPatch) -> None:
     recording = record(0, seconds=14.0)
     estimator = drive(recording, until=6.0)[0]

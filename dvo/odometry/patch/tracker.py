@@ -246,7 +246,10 @@ class PatchOdometry:
         seen = observe(self.network, image, admitted.camera, self.select, self.device, mask=mask)
         if self.config.scale.depth or self.config.scale.stereo:
             seen = measure_depth(self.network, seen, admitted.frame, self.config.scale, self.config.measuring)
-        state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
+        state.info = {
+            "working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist(),
+            "precision": "float32" if self.network is self.model else "bfloat16",
+        }  # fmt: skip
         state.checks.see(len(self.graph.log.frames) - 1, image, seen.image_intrinsics, mask)
         estimate = self._take(View([record], seen))
         return self._begin_segment() if len(state.waiting) >= self.config.patience else estimate

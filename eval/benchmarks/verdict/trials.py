@@ -111,7 +111,7 @@ def carry_out(trial: Trial) -> Outcome:
         odometry = dvo.load("small", device="cpu", seed=seed, loops=False)
         assert isinstance(odometry, PatchOdometry)
         if trial.kind == "weights":
-            failures.spoil(odometry.model, trial.number)
+            failures.spoil(odometry.network, trial.number)
         return odometry
 
     result = session.run(build(0), changed, again=build).result

@@ -169,7 +169,7 @@ def test_the_keyframes_of_the_window_have_the_same_descriptors_as_computed_from_
     assert places.identifiers[-1] == last
     with torch.inference_mode():
         image = odometry.window.frames[-1].image
-        again = odometry.loops.finder.descriptor(image, encode_image(odometry.model, image, odometry.device).matching)
+        again = odometry.loops.finder.descriptor(image, encode_image(odometry.network, image, odometry.device).matching)
     np.testing.assert_allclose(places.descriptor(last), again, atol=1e-3)
 
 

@@ -50,6 +50,20 @@ def test_same_seed_same_bytes_and_another_seed_another_trajectory():
     assert first.tobytes() != other.tobytes()
 
 
+def test_precision_is_that_of_the_setting_or_of_the_processor(monkeypatch):
+    for units, precision, dtype in (
+        (False, "auto", torch.float32), (True, "auto", torch.bfloat16), (True, "float32", torch.float32),
+        (False, "bfloat16", torch.bfloat16),
+    ):  # fmt: skip
+        monkeypatch.setattr("dvo.odometry.patch.tracker.multiplies_bfloat16", lambda device, units=units: units)
+        odometry = tracker(replace(SMALL, precision=precision))
+        assert {p.dtype for p in odometry.network.parameters()} == {dtype}
+        assert {p.dtype for p in odometry.model.parameters()} == {torch.float32}
+    results = [run(tracker(replace(SMALL, precision="bfloat16")), frames(9))[1] for _ in range(2)]
+    assert results[0].info["precision"] == "bfloat16" and results[0].frames_lost == 0
+    assert results[0].trajectory.poses_wc.tobytes() == results[1].trajectory.poses_wc.tobytes()
+
+
 @pytest.mark.slow
 def test_the_state_space_operator_tracks_and_its_states_stay_bounded():
     odometry = tracker(operator="mamba")
@@ -134,7 +148,7 @@ def test_poses_that_are_not_finite_are_not_given():
     for frame in images[:8]:
         odometry.track(frame)
     with torch.no_grad():
-        for parameter in odometry.model.update.parameters():
+        for parameter in odometry.network.update.parameters():
             parameter.fill_(float("nan"))
     estimate = odometry.track(images[8])
     assert estimate.status is Status.LOST and estimate.pose_wc is None

@@ -23,7 +23,7 @@ def tried(request):
     for frame in seen:
         odometry.track(frame)
     record = odometry.graph.log.add(new.timestamp)
-    return odometry, View([record], observe(odometry.model, new.image, new.camera, odometry.select, odometry.device))
+    return odometry, View([record], observe(odometry.network, new.image, new.camera, odometry.select, odometry.device))
 
 
 @torch.inference_mode()

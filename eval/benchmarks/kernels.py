@@ -2,7 +2,7 @@
 
 Prints for each kernel a line: size, milliseconds of the kernel and of its PyTorch twin on one thread (medians of
 ``--repeats`` runs that take turns, so that a busy machine slows both), the ratio, and the largest difference of the
-results.
+results. The lines of ``bfloat16`` have the network in that precision, and in float32 in the place of the twin.
 """
 
 from __future__ import annotations
@@ -24,9 +24,14 @@ from dvo.ba.sparse.global_adjust import GlobalBAOptions
 from dvo.ba.sparse.levenberg import LMOptions
 from dvo.core.command_line import OneLineParser
 from dvo.core.kernels import CHOICES, VARIABLE
+from dvo.models.patch_vo import PatchVO
+from dvo.models.schedule import full_graph
 from dvo.nets.alignment.alignment import align_patches
+from dvo.nets.correlation.correlation import Correlation
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation
+from dvo.nets.patch.config import preset
 from dvo.nets.patch.encoder import normalise
+from dvo.nets.patch.patchifier import normalise_images
 
 Call = Callable[[], Tensor]
 CPU = torch.device("cpu")
@@ -118,6 +123,36 @@ KERNELS: dict[str, Callable[[torch.Generator, torch.device], tuple[str, Call]]] 
 which asks :func:`dvo.core.kernels.use_kernels`."""
 
 
+def encoder(generator: torch.Generator) -> tuple[str, Call, Call]:
+    """Encoder of the network ``small``, untrained, in both precisions."""
+    image = torch.randint(0, 256, (240, 320, 3), generator=generator, dtype=torch.uint8).permute(2, 0, 1)[None, None]
+
+    def call(model: PatchVO) -> Call:
+        return lambda: model.patchify.encode(normalise_images(image)).matching
+
+    model = PatchVO(preset("small")).eval()
+    return "320x240", call(model.in_bfloat16()), call(model)
+
+
+def update_operator(generator: torch.Generator) -> tuple[str, Call, Call]:
+    """Update operator of the network ``small``, untrained, on the edges of a window in both precisions."""
+    config, graph = preset("small"), full_graph(frames=9, patches=24, self_edges=False)
+    state = torch.randn(1, len(graph), config.hidden_channels, generator=generator)
+    channels = config.correlation_channels // len(config.pyramid)
+    levels = [torch.randn(1, len(graph), channels, generator=generator) for _ in config.pyramid]
+    correlation = Correlation(levels, order="pixels_first")
+
+    def call(model: PatchVO) -> Call:
+        return lambda: model.update(state, state, correlation, graph)[1]
+
+    model = PatchVO(config).eval()
+    return f"{len(graph)} edges", call(model.in_bfloat16()), call(model)
+
+
+PRECISIONS = {"encoder, bfloat16": encoder, "update, bfloat16": update_operator}
+"""By name: a function of a random generator that returns a description of the size, and calls in both precisions."""
+
+
 def compare(call: Call, repeats: int, device: torch.device) -> tuple[float, float, float]:
     """Run a kernel and its twin in turns.
 
@@ -129,18 +164,27 @@ def compare(call: Call, repeats: int, device: torch.device) -> tuple[float, floa
     Returns:
         Median seconds of the kernel and of the twin, and the largest absolute difference of the results.
     """
-    seconds: dict[str, list[float]] = {choice: [] for choice in CHOICES}
-    found = {}
-    for repeat in range(repeats + 1):
-        for choice in CHOICES:
-            with mock.patch.dict(os.environ, {VARIABLE: choice}):
-                start = time.perf_counter()
-                found[choice] = call()
-                getattr(torch, device.type).synchronize()  # a module for each kind of device
-                seconds[choice] += [time.perf_counter() - start] if repeat else []
+
+    def chosen(choice: str) -> Tensor:
+        with mock.patch.dict(os.environ, {VARIABLE: choice}):
+            return call()
+
     kernel, twin = CHOICES
-    largest = (found[kernel] - found[twin]).abs().max().item()
-    return statistics.median(seconds[kernel]), statistics.median(seconds[twin]), largest
+    return in_turns(lambda: chosen(kernel), lambda: chosen(twin), repeats, device)
+
+
+def in_turns(one: Call, other: Call, repeats: int, device: torch.device) -> tuple[float, float, float]:
+    """Run two computations in turns; see :func:`compare`."""
+    calls, found = (one, other), [torch.empty(0), torch.empty(0)]
+    seconds: tuple[list[float], list[float]] = ([], [])
+    for repeat in range(repeats + 1):
+        for k, call in enumerate(calls):
+            start = time.perf_counter()
+            found[k] = call()
+            getattr(torch, device.type).synchronize()  # a module for each kind of device
+            seconds[k].extend([time.perf_counter() - start] if repeat else [])
+    largest = (found[0] - found[1]).abs().max().item()
+    return statistics.median(seconds[0]), statistics.median(seconds[1]), largest
 
 
 def main() -> None:
@@ -149,15 +193,21 @@ def main() -> None:
     parser.add_argument("--only", default="", help="kernels whose names contain this")
     parser.add_argument("--repeats", type=int, default=20, help="(%(default)s)")
     options = parser.parse_args()
-    chosen = [name for name in KERNELS if options.only in name]
+    names = (*KERNELS, *PRECISIONS)
+    chosen = [name for name in names if options.only in name]
     if not chosen or options.repeats < 1:
-        parser.error(f"no run: --only is part of {', '.join(KERNELS)}, --repeats at least 1")
+        parser.error(f"no run: --only is part of {', '.join(names)}, --repeats at least 1")
     torch.set_num_threads(1)
     print(f"{'kernel':24} {'size':28} {'ms':>8} {'twin ms':>8} {'ratio':>6} {'difference':>11}")
     with torch.inference_mode():
         for name in chosen:
-            size, call = KERNELS[name](torch.Generator().manual_seed(0), CPU)
-            kernel, twin, largest = compare(call, options.repeats, CPU)
+            generator = torch.Generator().manual_seed(0)
+            if name in KERNELS:
+                size, call = KERNELS[name](generator, CPU)
+                kernel, twin, largest = compare(call, options.repeats, CPU)
+            else:
+                size, half, single = PRECISIONS[name](generator)
+                kernel, twin, largest = in_turns(half, single, options.repeats, CPU)
             print(f"{name:24} {size:28} {1e3 * kernel:8.2f} {1e3 * twin:8.2f} {twin / kernel:6.1f} {largest:11.1e}")
 
 

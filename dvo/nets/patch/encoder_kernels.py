@@ -70,11 +70,11 @@ def normalise(x: Array, eps: float, rectified: bool, skip: Array) -> None:
                 if squares:
                     for s in range(first, min(pixels, first + _RUN)):
                         for c in range(channels):
-                            part[c] += (_number(image[s, c]) - mean[c]) * (_number(image[s, c]) - mean[c])
+                            part[c] += (_number(image[s, c]) - mean[c]) * (_number(image[s, c]) - mean[c])  # type: ignore[call-arg]
                 else:
                     for s in range(first, min(pixels, first + _RUN)):
                         for c in range(channels):
-                            part[c] += _number(image[s, c])
+                            part[c] += _number(image[s, c])  # type: ignore[call-arg]
                 for c in range(channels):
                     total[c] += part[c]
             for c in range(channels):
@@ -86,12 +86,12 @@ def normalise(x: Array, eps: float, rectified: bool, skip: Array) -> None:
             beside = skip[n]
             for s in range(pixels):
                 for c in range(channels):
-                    value = (_number(image[s, c]) - mean[c]) * factor[c]
+                    value = (_number(image[s, c]) - mean[c]) * factor[c]  # type: ignore[call-arg]
                     value = low if value < low else value  # NaN stays
                     value = _number(beside[s, c]) + value
                     image[s, c] = _stored(zero if value < zero else value, image[s, c])
         else:
             for s in range(pixels):
                 for c in range(channels):
-                    value = (_number(image[s, c]) - mean[c]) * factor[c]
+                    value = (_number(image[s, c]) - mean[c]) * factor[c]  # type: ignore[call-arg]
                     image[s, c] = _stored(low if value < low else value, image[s, c])

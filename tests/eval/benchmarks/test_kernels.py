@@ -12,6 +12,14 @@ def test_a_line_of_a_kernel_and_its_twin(capsys, monkeypatch):
     assert line.startswith("correlation, level 4") and 0 <= float(line.split()[-1]) < 1e-3
 
 
+def test_prints_both_precisions_of_the_network(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["kernels", "--only", "bfloat16", "--repeats", "1"])
+    main()
+    lines = capsys.readouterr().out.splitlines()[1:]
+    assert [line.split(",")[0] for line in lines] == ["encoder", "update"]
+    assert all(0 < float(line.split()[-1]) < 0.1 for line in lines)
+
+
 @pytest.mark.parametrize("arguments", [["--only", "none"], ["--repeats", "0"]])
 def test_no_run(capsys, monkeypatch, arguments):
     monkeypatch.setattr("sys.argv", ["kernels", *arguments])

@@ -1,9 +1,10 @@
 """Benchmark of a training step: ``python -m eval.benchmarks.training_step [--repeats 5] [--size 120 160]``.
 
 Prints seconds of a step of ``configs/train/small.yaml`` with ``v2v.yaml`` and ``hard.yaml`` from
-``train/state/small.ckpt`` by part, with compiled kernels and with their PyTorch twins: medians of steps on one clip
-that take turns, so that a busy machine slows both. Time is that of the processor, summed over threads; with
-``--clock`` that of the clock. The losses of both after the first steps, from the same state, are printed too.
+``train/state/small.ckpt`` by part, with compiled kernels, with their PyTorch twins, and with kernels and the network in
+bfloat16 (``--trainer.precision bf16-mixed``): medians of steps on one clip that take turns, so that a busy machine
+slows all. Time is that of the processor, summed over threads; with ``--clock`` that of the clock. The losses of each
+after the first steps, from the same state, are printed too.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from train.studies.breakdown import measure
 ROOT = Path(__file__).resolve().parents[2]
 RECIPES = "small", "v2v", "hard"
 STATE = ROOT / "train" / "state" / "small.ckpt"
+VARIANTS = {"kernels": (CHOICES[0], False), "twins": (CHOICES[1], False), "bfloat16": (CHOICES[0], True)}
+"""Choice of kernels, and whether the network computes in bfloat16, by name."""
 
 
 def trained_program() -> TrainingProgram:
@@ -45,38 +48,39 @@ def trained_program() -> TrainingProgram:
 
 
 class Losses:
-    """Steps of a program, whose losses are kept."""
+    """Steps of a program, perhaps with automatic mixed precision, whose losses are kept."""
 
-    def __init__(self, program: TrainingProgram) -> None:
-        self.program, self.values = program, list[float]()
+    def __init__(self, program: TrainingProgram, half: bool) -> None:
+        self.program, self.half, self.values = program, half, list[float]()
         self._step = program.training_step
         program.training_step = self.step  # type: ignore[method-assign]
 
     def step(self, batch: dict[str, Tensor], index: int) -> Tensor | None:
         """A step of the program."""
-        loss = self._step(batch, index)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
+            loss = self._step(batch, index)
         self.values.append(float("nan") if loss is None else float(loss.detach()))
         return loss
 
 
 def compare(clip: dict[str, Tensor], repeats: int, processor: bool) -> tuple[dict[str, dict[str, float]], list[Losses]]:
-    """Median seconds by part with each choice of :data:`CHOICES`, and the losses of both.
+    """Median seconds by part with each of :data:`VARIANTS`, and their losses.
 
     Args:
         clip: to train on.
         repeats: steps in the median, after one that does not count.
         processor: time of the processor instead of the clock.
     """
-    runs = {choice: Losses(trained_program()) for choice in CHOICES}
-    found: dict[str, list[dict[str, float]]] = {choice: [] for choice in CHOICES}
+    runs = {variant: Losses(trained_program(), half) for variant, (_, half) in VARIANTS.items()}
+    found: dict[str, list[dict[str, float]]] = {variant: [] for variant in VARIANTS}
     for _ in range(1 + repeats):
-        for choice, run in runs.items():
-            with mock.patch.dict(os.environ, {VARIABLE: choice}):
-                found[choice].append(measure(run.program, [clip], 1, 1, warm=0, processor=processor))  # type: ignore[arg-type]
+        for variant, run in runs.items():
+            with mock.patch.dict(os.environ, {VARIABLE: VARIANTS[variant][0]}):
+                found[variant].append(measure(run.program, [clip], 1, 1, warm=0, processor=processor))  # type: ignore[arg-type]
     names = dict.fromkeys(name for parts in found.values() for name in parts[-1] if name != "render")
     medians = {
-        choice: {name: statistics.median(x.get(name, 0.0) for x in parts[1:]) for name in names}
-        for choice, parts in found.items()
+        variant: {name: statistics.median(x.get(name, 0.0) for x in parts[1:]) for name in names}
+        for variant, parts in found.items()
     }
     return medians, list(runs.values())
 
@@ -94,13 +98,15 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     clip = MixedClips(0, [CurriculumStage(0, 1.0, 14.0, [tuple(options.size)])], 1)[0]
     medians, runs = compare(clip, options.repeats, not options.clock)
-    kernels, twins = (medians[choice] for choice in CHOICES)
+    kernels, twins, half = medians.values()
     print(f"{options.size[1]}x{options.size[0]}, {options.threads} thread(s), medians of {options.repeats} steps")
-    print(f"{'':32s}{'kernels':>9s}{'twins':>9s}{'ratio':>8s}")
+    print(f"{'':32s}{'kernels':>9s}{'twins':>9s}{'ratio':>8s}{'bfloat16':>10s}{'ratio':>8s}")
     for name in kernels:
-        ratio = kernels[name] / twins[name] if twins[name] else float("nan")
-        print(f"{name:32s}{kernels[name]:7.3f} s{twins[name]:7.3f} s{ratio:8.2f}")
-    print("losses: " + ", ".join(f"{a:.5f} / {b:.5f}" for a, b in zip(*(run.values for run in runs), strict=True)))
+        own, twin, other = (part[name] for part in (kernels, twins, half))
+        by_twin = [x / twin if twin else float("nan") for x in (own, other)]
+        print(f"{name:32s}{own:7.3f} s{twin:7.3f} s{by_twin[0]:8.2f}{other:8.3f} s{by_twin[1]:8.2f}")
+    values = zip(*(run.values for run in runs), strict=True)
+    print("losses: " + ", ".join(" / ".join(f"{x:.5f}" for x in step) for step in values))
 
 
 if __name__ == "__main__":

@@ -34,9 +34,11 @@ def normalise(
     if isinstance(norm, nn.InstanceNorm2d) and use_kernels(*given, half=True) and all(map(_has_channels_last, given)):
         from dvo.nets.patch import encoder_kernels
 
-        bits = (one.view(torch.uint16) if one.dtype == torch.bfloat16 else one for one in given)
-        pixels, *beside = (one.permute(0, 2, 3, 1).flatten(1, 2).numpy() for one in bits)
-        encoder_kernels.normalise(pixels, norm.eps, rectified, beside[0] if beside else pixels[:0])
+        half = x.dtype == torch.bfloat16
+        kernel = encoder_kernels.normalise_bfloat16 if half else encoder_kernels.normalise
+        arrays = (one.view(torch.uint16) if half else one for one in given)
+        pixels, *beside = (one.permute(0, 2, 3, 1).flatten(1, 2).numpy() for one in arrays)
+        kernel(pixels, norm.eps, rectified, beside[0] if beside else pixels[:0])
         return x
     x = norm(x)
     x = F.relu(x) if rectified else x

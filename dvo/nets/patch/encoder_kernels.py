@@ -1,4 +1,4 @@
-"""Kernel of :func:`dvo.nets.patch.encoder.normalise`."""
+"""Kernels of :func:`dvo.nets.patch.encoder.normalise`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from dvo.core.compiled import compiled
+from dvo.core.compiled import compiled, part
 
 Array = Any
 
@@ -45,16 +45,9 @@ def _stored(context, value, like):
     return like(types.float32, like), generate
 
 
-@compiled
-def normalise(x: Array, eps: float, rectified: bool, skip: Array) -> None:
-    """Instance normalisation in place, perhaps with a rectifier, and the sum with a skip, rectified.
-
-    Args:
-        x: ``(N, S, C)``, images, pixels and channels: float32, or the bits of bfloat16 as uint16.
-        eps: added to the variance.
-        rectified: with a rectifier.
-        skip: ``(N, S, C)``, added before another rectifier; ``(0, S, C)``: none.
-    """
+@part
+def _normalise(x, eps, rectified, skip):
+    """Body of both kernels."""
     images, pixels, channels = x.shape
     zero = np.float32(0)
     low = zero if rectified else np.float32(-np.inf)
@@ -95,3 +88,22 @@ def normalise(x: Array, eps: float, rectified: bool, skip: Array) -> None:
                 for c in range(channels):
                     value = (_number(image[s, c]) - mean[c]) * factor[c]  # type: ignore[call-arg]
                     image[s, c] = _stored(low if value < low else value, image[s, c])
+
+
+@compiled
+def normalise(x: Array, eps: float, rectified: bool, skip: Array) -> None:
+    """Instance normalisation in place, perhaps with a rectifier, and the sum with a skip, rectified.
+
+    Args:
+        x: ``(N, S, C)`` float32, images, pixels and channels.
+        eps: added to the variance.
+        rectified: with a rectifier.
+        skip: ``(N, S, C)``, added before another rectifier; ``(0, S, C)``: none.
+    """
+    _normalise(x, eps, rectified, skip)
+
+
+@compiled
+def normalise_bfloat16(x: Array, eps: float, rectified: bool, skip: Array) -> None:
+    """:func:`normalise` of the bits of bfloat16, as uint16; all is computed in float32."""
+    _normalise(x, eps, rectified, skip)

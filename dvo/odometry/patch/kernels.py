@@ -19,6 +19,7 @@ KERNELS = {
         "f4[:,:,::1], b1[:,:,::1]"
     ),
     "dvo.nets.patch.encoder_kernels:normalise": "f4[:,:,::1], f8, b1, f4[:,:,::1]",
+    "dvo.nets.patch.encoder_kernels:normalise_bfloat16": "u2[:,:,::1], f8, b1, u2[:,:,::1]",
     "dvo.nets.correlation.edge_correlation_kernels:correlate": (
         "f4[:,:,:,::1], f4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, f4[:,:,:,::1]"
     ),

@@ -19,7 +19,7 @@ from pathlib import Path
 from dvo.core.ahead import compiled_by
 from dvo.core.limits import TRACKING, memory_of_group
 from dvo.core.threads import CGROUPS, MEMBERSHIP, available_cores
-from dvo.odometry.patch.kernels import KERNELS
+from dvo.odometry.patch.kernels import needed
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 _MEMORY = 300 * 2**20  # bytes of the process
@@ -95,7 +95,7 @@ def main() -> None:
     threading.Thread(target=listen, daemon=True).start()
     from numba.core import sigutils
 
-    for name, types in KERNELS.items():
+    for name, types in needed().items():
         module, function = name.split(":")
         kernel = getattr(import_module(module), function)
         if kernel._cache.cache_path is None:

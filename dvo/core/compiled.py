@@ -6,8 +6,9 @@ import pickle
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+import llvmlite.binding
 import numba
-from numba.core import event, sigutils
+from numba.core import config, event, sigutils
 from numba.core.compiler_lock import global_compiler_lock
 
 from dvo.core import ahead
@@ -83,6 +84,12 @@ def load_kept(kernel: Any, types: str) -> None:
         if found is not None:  # as Dispatcher.compile does it
             kernel.targetctx.insert_user_function(found.entry_point, found.fndesc, [found.library])
             kernel.add_overload(found)
+
+
+def has_matrix_units() -> bool:
+    """Tell if kernels are compiled for a CPU with matrix units for bfloat16 (Intel's AMX), which no others may use."""
+    another = any(getattr(config, name, None) for name in ("CPU_NAME", "CPU_FEATURES"))
+    return not another and bool(llvmlite.binding.get_host_cpu_features().get("amx-bf16"))
 
 
 def name_of(function: Callable[..., Any]) -> str:

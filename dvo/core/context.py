@@ -93,11 +93,13 @@ def full_precision(device: torch.device) -> Iterator[None]:
 def multiplies_bfloat16(device: torch.device) -> bool:
     """Tell if a device is a CPU with units for matrix products of bfloat16, which are several times as fast there.
 
+    The operating system is asked for the permission to use them, which a process needs once.
+
     Args:
         device: any.
     """
-    units = getattr(torch.cpu, "_is_amx_tile_supported", None)  # torch 2.6 and newer
-    return device.type == "cpu" and units is not None and bool(units())
+    ask = getattr(torch.cpu, "_init_amx", None)  # torch 2.6 and newer
+    return device.type == "cpu" and ask is not None and bool(torch.cpu._is_amx_tile_supported() and ask())
 
 
 _forks = {"work": False, "after work": False}  # several threads have computed; this process was forked after that

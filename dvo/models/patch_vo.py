@@ -81,6 +81,11 @@ class PatchVO(nn.Module):
         select: PatchSelection = SELECTIONS.resolve(name or self.config.selection)
         return select
 
+    @property
+    def precision(self) -> torch.dtype:
+        """Type of the encoder's parameters."""
+        return self.patchify.fnet.conv1.weight.dtype
+
     @torch.inference_mode(False)
     def in_bfloat16(self) -> PatchVO:
         """Copy for inference that multiplies in bfloat16, several times as fast on processors that have units for it.

@@ -9,6 +9,7 @@ window, so that a row of a window is one contiguous range at every position.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -19,6 +20,7 @@ from dvo.core.kernels import use_device_kernels, use_kernels
 # written to: there they are as many as a window has, so that no frame waits for a copy of all maps.
 FIRST_MAPS, FIRST_ON_DEVICE = 40, 8
 _PIECE, _LARGE_PIECE = 32, 1024  # edges processed at once: in the cache of a processor; on other devices
+_TILED = 32, 16, 3  # channels are a multiple of; pixels of a patch, and radius, at most
 _SPREAD = 4  # pixels between those of a patch, up to which they share one window of the map
 
 
@@ -29,6 +31,7 @@ class EdgeCorrelation:
         scale: down-sampling of the level relative to the features.
         radius: correlation radius in pixels of the level.
         device: of the maps.
+        dtype: of maps and channels; bfloat16 is for matrix units of a CPU, and sums are those of float32.
 
     Attributes:
         maps: ``(N, H, W, C)`` features by map slot, each in a border of ``2 radius + 2`` zeros; others are not defined.
@@ -42,9 +45,11 @@ class EdgeCorrelation:
         torch.Size([2, 441])
     """
 
-    def __init__(self, scale: float, radius: int, device: torch.device | str) -> None:
+    def __init__(
+        self, scale: float, radius: int, device: torch.device | str, dtype: torch.dtype = torch.float32
+    ) -> None:
         self.scale, self.radius = scale, radius
-        self.maps = torch.zeros(0, 0, 0, 0, device=device)
+        self.maps = torch.zeros(0, 0, 0, 0, device=device, dtype=dtype)
 
     def keep_map(self, slot: int, level: Float[Tensor, "C h w"]) -> None:
         """Store the features of a frame; the storage grows with the largest slot, by doubling.
@@ -57,7 +62,7 @@ class EdgeCorrelation:
         have, border = len(self.maps), 2 * self.radius + 2
         if slot >= have:
             first = FIRST_MAPS if level.device.type == "cpu" else FIRST_ON_DEVICE
-            grown = level.new_empty(max(slot + 1, 2 * have, first), h + 2 * border, w + 2 * border, c)
+            grown = self.maps.new_empty(max(slot + 1, 2 * have, first), h + 2 * border, w + 2 * border, c)
             if have:
                 grown[:have] = self.maps
             self.maps = grown
@@ -84,6 +89,8 @@ class EdgeCorrelation:
             for a pixel whose position is not a number.
         """
         at = (coords.flatten(1, 2) / self.scale).contiguous()
+        if self.maps.dtype == torch.bfloat16:
+            return self._lookup_tiled(at, features, kk, frames).flatten(1)
         if use_kernels(self.maps, features, at):
             from dvo.nets.correlation.edge_correlation_kernels import correlate
 
@@ -101,6 +108,37 @@ class EdgeCorrelation:
             out = correlate_edges(self.maps, features, at, kk, frames, self.radius)
         return out.flatten(1)
 
+    def _lookup_tiled(self, at: Tensor, features: Tensor, kk: Tensor, frames: Tensor) -> Tensor:
+        """Look-up in maps of bfloat16."""
+        if use_kernels(features, at) and fits_tiles(features.shape[2], features.shape[1], self.radius):
+            from dvo.core.compiled import has_matrix_units
+
+            if has_matrix_units():
+                from dvo.nets.correlation.edge_correlation_tile_kernels import correlate
+
+                side = 2 * self.radius + 1
+                out = torch.empty(*at.shape[:2], side, side, dtype=torch.bfloat16)
+                into = frames.numpy()
+                correlate(
+                    self.maps.view(torch.uint16).numpy(), features.contiguous().numpy(), at.numpy(), kk.numpy(),
+                    np.argsort(into, kind="stable"), into, self.radius, out.view(torch.uint16).numpy(),
+                )  # fmt: skip
+                return out
+        rounded = features.bfloat16().float()
+        return correlate_edges(self.maps, rounded, at, kk, frames, self.radius).bfloat16()
+
+
+def fits_tiles(channels: int, pixels: int, radius: int) -> bool:
+    """Tell if matrix units can look up the edges of a network.
+
+    Args:
+        channels: of the features.
+        pixels: of a patch.
+        radius: of the correlation.
+    """
+    multiple, most, largest = _TILED
+    return channels % multiple == 0 and pixels <= most and radius <= largest
+
 
 def correlate_edges(
     maps: Float[Tensor, "N H W C"],
@@ -113,7 +151,7 @@ def correlate_edges(
     """Twin of the kernel: look up edges at one level.
 
     Args:
-        maps: padded, see :class:`EdgeCorrelation`.
+        maps: padded, see :class:`EdgeCorrelation`; of any type.
         features, kk, frames: see :meth:`EdgeCorrelation.lookup`.
         at: ``x, y`` in pixels of the level.
         radius: ``r``, pixels of the level.
@@ -145,6 +183,7 @@ def correlate_edges(
     piece = _PIECE if at.device.type == "cpu" else _LARGE_PIECE
     for edges in torch.arange(e, device=at.device).split(piece):
         window = runs.index_select(0, (first[edges, None] + rows * width).flatten()).view(-1, side * side, c)
+        window = window.to(features.dtype)
         products = torch.bmm(features[kk[edges]], window.mT)
         row = torch.arange(len(edges), device=at.device)[:, None] * q + pixels
         start = (row * side + inner[edges, :, 1]) * side + inner[edges, :, 0]

@@ -19,7 +19,6 @@ KERNELS = {
         "f4[:,:,::1], b1[:,:,::1]"
     ),
     "dvo.nets.patch.encoder_kernels:normalise": "f4[:,:,::1], f8, b1, f4[:,:,::1]",
-    "dvo.nets.patch.encoder_kernels:normalise_bfloat16": "u2[:,:,::1], f8, b1, u2[:,:,::1]",
     "dvo.nets.correlation.edge_correlation_kernels:correlate": (
         "f4[:,:,:,::1], f4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, f4[:,:,:,::1]"
     ),
@@ -85,6 +84,20 @@ KERNELS = {
     ),
 }
 """Kernels in the order in which a run needs them, each with the types of its arguments."""
+MATRIX_KERNELS = {
+    "dvo.nets.patch.encoder_kernels:normalise_bfloat16": "u2[:,:,::1], f8, b1, u2[:,:,::1]",
+    "dvo.nets.correlation.edge_correlation_tile_kernels:correlate": (
+        "u2[:,:,:,::1], f4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8[::1], i8, u2[:,:,:,::1]"
+    ),
+}
+"""Those of a CPU with matrix units, which come first there."""
+
+
+def needed() -> dict[str, str]:
+    """Kernels of this machine, see :data:`KERNELS`."""
+    from dvo.core.compiled import has_matrix_units
+
+    return MATRIX_KERNELS | KERNELS if has_matrix_units() else KERNELS
 
 
 @cache
@@ -104,7 +117,7 @@ def _load() -> None:
         return
     from dvo.core.compiled import load_kept
 
-    for name, types in KERNELS.items():
+    for name, types in needed().items():
         if not threading.main_thread().is_alive():  # the interpreter waits for this thread before it ends
             return
         module, function = name.split(":")

@@ -110,7 +110,7 @@ class FrameAlignment:
         self._poses: torch.Tensor | None = None  # of the window that it goes on from
         self._last: list[_Seen] = []
         self._patches: _Patches
-        self._base: np.ndarray  # brightness and sharpness of the newest keyframe
+        self._base: np.ndarray | None = None  # brightness and sharpness of the newest keyframe, once it is looked at
 
     def align(
         self, image: np.ndarray, intrinsics: np.ndarray, mask: np.ndarray | None, time: float
@@ -136,7 +136,8 @@ class FrameAlignment:
         if not len(patches.kk) or patches.motion(start) > 2 * limit or patches.motion(start, last.matrix) > limit / 2:
             return None
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        brightness, sharpness = _look(grey) / self._base
+        patches, base = self._looked_at(window)
+        brightness, sharpness = _look(grey) / base
         if not (1 / MAX_BRIGHTER <= brightness <= MAX_BRIGHTER and sharpness >= MAX_BLUR):
             return None
         pose = patches.followed(last, grey, start)
@@ -169,13 +170,22 @@ class FrameAlignment:
         newest, self._poses = window.frames[-1], window.poses_cw
         assert newest.image is not None and self.patch_window.alignment is not None
         grey = cv2.cvtColor(newest.image, cv2.COLOR_RGB2GRAY)
-        self._base = np.maximum(_look(grey), 1e-3)
-        least = max(MIN_TEXTURE, MIN_SIGNAL * noise(grey))
-        self._patches = _Patches.of(window, intrinsics, self.patch_window.alignment.images, self.options.window, least)
+        self._patches, self._base = _Patches.of(window, intrinsics), None
         matrices = pose_matrices(window.poses_cw[-2:].cpu().numpy())
         none = np.zeros((0, 0), np.uint8)
         before = [_Seen(none, f.timestamp, m) for f, m in zip(window.frames[-2:-1], matrices[:-1], strict=True)]
         self._last = [*before, _Seen(grey, newest.timestamp, matrices[-1])]
+
+    def _looked_at(self, window: Window) -> tuple[_Patches, np.ndarray]:
+        """Patches with what their images tell of them, and brightness and sharpness of the newest keyframe."""
+        newest, alignment = window.frames[-1], self.patch_window.alignment
+        assert newest.image is not None and alignment is not None
+        if self._base is None:
+            grey = cv2.cvtColor(newest.image, cv2.COLOR_RGB2GRAY)
+            self._base = np.maximum(_look(grey), 1e-3)
+            least = max(MIN_TEXTURE, MIN_SIGNAL * noise(grey))
+            self._patches = self._patches.seen_in(alignment.images, self.options.window, least)
+        return self._patches, self._base
 
     def _refined(
         self, window: Window, patches: _Patches, image: np.ndarray, mask: np.ndarray | None, pose: np.ndarray
@@ -227,7 +237,7 @@ class _Patches:
         centres: ``(K, 2)`` in their keyframes.
         points: ``(K, 3, 3)`` world points of the centre and of the pixels a feature pixel to the right and below.
         confidence: ``(K, 2)`` mean of the network's in their measurements.
-        textured: ``(K,)`` bool, those that can be aligned (:data:`MIN_TEXTURE`).
+        textured: ``(K,)`` bool, those that can be aligned (:data:`MIN_TEXTURE`); none before :meth:`seen_in`.
         camera: ``(4,)`` fx fy cx cy of the working image.
         newest: ``(4, 4)`` pose of the newest keyframe, world to camera.
     """
@@ -242,7 +252,7 @@ class _Patches:
     newest: np.ndarray
 
     @classmethod
-    def of(cls, window: Window, camera: np.ndarray, images: torch.Tensor, side: int, least: float) -> _Patches:
+    def of(cls, window: Window, camera: np.ndarray) -> _Patches:
         m, n, stride = window.per_frame, len(window), ModelConfig.STRIDE
         first = max(0, n - KEYFRAMES)
         middle = window.patches.shape[-1] // 2
@@ -266,11 +276,15 @@ class _Patches:
         points = rays @ to_world[:, :3, :3].transpose(0, 2, 1) + to_world[:, None, :3, 3]
         slots = np.array([frame.map_slot for frame in window.frames])[frames]
         pixels = centres[rows] * stride
-        centre = torch.from_numpy(pixels.astype(np.float32)).to(images.device)
-        strength = texture(images, torch.from_numpy(slots).to(images.device), centre, side)
-        textured = strength.cpu().numpy() > least
+        textured = np.zeros(len(rows), bool)
         return cls(rows + first * m, slots, pixels, points, mean[rows], textured, np.asarray(camera, np.float64),
                    poses[-1])  # fmt: skip
+
+    def seen_in(self, images: torch.Tensor, side: int, least: float) -> _Patches:
+        """The same with ``textured``, by windows of a side in their keyframes' images."""
+        centre = torch.from_numpy(self.centres.astype(np.float32)).to(images.device)
+        strength = texture(images, torch.from_numpy(self.slots).to(images.device), centre, side)
+        return replace(self, textured=strength.cpu().numpy() > least)
 
     def projected(self, rows: np.ndarray | slice, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Centres ``(e, 2)`` in a frame with a pose ``(4, 4)``, pixels, and the points ``(e, 3)`` before its camera."""

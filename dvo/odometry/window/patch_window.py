@@ -13,6 +13,7 @@ from torch import Tensor
 from dvo.ba.kernels import Kernel
 from dvo.ba.options import BADamping, BAOptions
 from dvo.ba.problem import Factor
+from dvo.core.context import multiplies_bfloat16
 from dvo.map.edges import PatchGraph
 from dvo.map.measurements import depth_factors
 from dvo.map.window import Keyframe, Window, WindowSnapshot
@@ -20,8 +21,7 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.step import Revision, UpdateState, revise, step
 from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.nets.correlation.correlation import Correlation
-from dvo.nets.correlation.edge_correlation import EdgeCorrelation
-from dvo.nets.patch.config import ModelConfig
+from dvo.nets.correlation.edge_correlation import EdgeCorrelation, fits_tiles
 from dvo.nets.patch.patchifier import patch_coordinates, pool_levels
 from dvo.odometry.frames.front_end import View, keyframe_of
 from dvo.odometry.window.alignment import AlignmentSnapshot, WindowAlignment
@@ -110,13 +110,17 @@ class WindowCorrelation:
 
     Args:
         window: provides the edges and patch features.
-        config: of the network.
+        model: the network, whose precision is that of the maps where the device has units for it.
         device: of the maps.
     """
 
-    def __init__(self, window: Window, config: ModelConfig, device: torch.device) -> None:
+    def __init__(self, window: Window, model: PatchVO, device: torch.device) -> None:
+        config = model.config
         self.window, self.pyramid = window, config.pyramid
-        self.levels = [EdgeCorrelation(scale, config.radius, device) for scale in config.pyramid]
+        tiled = fits_tiles(config.feature_channels, config.patch_size**2, config.radius)
+        half = model.precision == torch.bfloat16 and tiled and multiplies_bfloat16(device)
+        dtype = torch.bfloat16 if half else torch.float32
+        self.levels = [EdgeCorrelation(scale, config.radius, device, dtype) for scale in config.pyramid]
 
     @property
     def capacity(self) -> int:
@@ -180,7 +184,7 @@ class PatchWindow:
     ) -> None:
         self.model, self.window, self.settings, self.device = model, window, settings, device
         self.sensors = tuple(sensors)
-        self.correlation = WindowCorrelation(window, model.config, device)
+        self.correlation = WindowCorrelation(window, model, device)
         self.alignment = None if settings.align == "none" else WindowAlignment(window, settings.alignment, device)
         self.bounds = (0, 0)
 

@@ -17,7 +17,7 @@ import pytest
 
 from dvo.commands import kernels
 from dvo.commands.kernels import compiled_meanwhile, done_file
-from dvo.odometry.patch.kernels import KERNELS
+from dvo.odometry.patch import kernels as of_tracker
 
 
 def command(**options):
@@ -37,22 +37,32 @@ def is_plain(arguments):
     return isinstance(compiled_meanwhile(arguments), contextlib.nullcontext)
 
 
-@pytest.mark.parametrize("name", KERNELS)
+ALL = of_tracker.KERNELS | of_tracker.MATRIX_KERNELS
+
+
+@pytest.mark.parametrize("name", ALL)
 def test_every_kernel_is_there_with_as_many_arguments(name):
     from numba.core import sigutils
 
     module, function = name.split(":")
-    types, _ = sigutils.normalize_signature(f"({KERNELS[name]},)")
+    types, _ = sigutils.normalize_signature(f"({ALL[name]},)")
     assert len(types) == len(inspect.signature(getattr(import_module(module), function).py_func).parameters)
 
 
 @pytest.mark.long
 def test_kernels_are_imported_without_torch():
-    modules = sorted({name.split(":")[0] for name in KERNELS})
+    modules = sorted({name.split(":")[0] for name in ALL})
     program = (
         f"import sys, importlib; [importlib.import_module(x) for x in {modules}]; assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+@pytest.mark.parametrize("units", [True, False])
+def test_those_for_matrix_units_are_for_such_machines_alone(units, monkeypatch):
+    """No other can compile them."""
+    monkeypatch.setattr("dvo.core.compiled.has_matrix_units", lambda: units)
+    assert of_tracker.needed() == (ALL if units else of_tracker.KERNELS)
 
 
 def test_no_process_where_it_would_be_of_no_use(cold, monkeypatch):

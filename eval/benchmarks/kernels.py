@@ -37,16 +37,19 @@ Call = Callable[[], Tensor]
 CPU = torch.device("cpu")
 
 
-def edge_correlation(generator: torch.Generator, device: torch.device, scale: int) -> tuple[str, Call]:
+def edge_correlation(
+    generator: torch.Generator, device: torch.device, scale: int, dtype: torch.dtype = torch.float32
+) -> tuple[str, Call]:
     """Look-up of the edges of a window at one level of 320x240 video.
 
     Args:
         generator: of the input.
         device: to compute on.
         scale: of the level.
+        dtype: of the maps.
     """
     edges, patches, frames, channels, height, width = 720, 192, 9, 64, 60, 80
-    level = EdgeCorrelation(scale, radius=3, device=device)
+    level = EdgeCorrelation(scale, radius=3, device=device, dtype=dtype)
     for slot in range(frames):
         level.keep_map(slot, torch.randn(channels, height // scale, width // scale, generator=generator).to(device))
     features = torch.randn(patches, 9, channels, generator=generator)
@@ -149,7 +152,21 @@ def update_operator(generator: torch.Generator) -> tuple[str, Call, Call]:
     return f"{len(graph)} edges", call(model.in_bfloat16()), call(model)
 
 
-PRECISIONS = {"encoder, bfloat16": encoder, "update, bfloat16": update_operator}
+def correlation(generator: torch.Generator) -> tuple[str, Call, Call]:
+    """Look-up at the finer level in both precisions."""
+    seed = generator.initial_seed()
+    (size, half), (_, single) = (
+        edge_correlation(torch.Generator().manual_seed(seed), CPU, 1, dtype)
+        for dtype in (torch.bfloat16, torch.float32)
+    )
+    return size, lambda: half().float(), single
+
+
+PRECISIONS = {
+    "encoder, bfloat16": encoder,
+    "correlation, bfloat16": correlation,
+    "update, bfloat16": update_operator,
+}
 """By name: a function of a random generator that returns a description of the size, and calls in both precisions."""
 
 

@@ -16,8 +16,8 @@ def test_prints_both_precisions_of_the_network(monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["kernels", "--only", "bfloat16", "--repeats", "1"])
     main()
     lines = capsys.readouterr().out.splitlines()[1:]
-    assert [line.split(",")[0] for line in lines] == ["encoder", "update"]
-    assert all(0 < float(line.split()[-1]) < 0.1 for line in lines)
+    assert [line.split(",")[0] for line in lines] == ["encoder", "correlation", "update"]
+    assert all(0 < float(line.split()[-1]) < 0.2 for line in lines)
 
 
 @pytest.mark.parametrize("arguments", [["--only", "none"], ["--repeats", "0"]])

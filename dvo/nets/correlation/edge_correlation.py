@@ -119,8 +119,9 @@ class EdgeCorrelation:
                 side = 2 * self.radius + 1
                 out = torch.empty(*at.shape[:2], side, side, dtype=torch.bfloat16)
                 into = frames.numpy()
+                pairs = features.bfloat16().contiguous().view(torch.uint16).numpy().view(np.uint32)
                 correlate(
-                    self.maps.view(torch.uint16).numpy(), features.contiguous().numpy(), at.numpy(), kk.numpy(),
+                    self.maps.view(torch.uint16).numpy(), pairs, at.numpy(), kk.numpy(),
                     np.argsort(into, kind="stable"), into, self.radius, out.view(torch.uint16).numpy(),
                 )  # fmt: skip
                 return out

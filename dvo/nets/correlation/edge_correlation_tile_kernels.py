@@ -64,10 +64,10 @@ def _release(context):
 
 
 @intrinsic
-def _row_of_products(context, maps, first, pairs, second, channels, products, row):
+def _row_of_products(context, maps, first, tiles, second, channels, products, row):
     """Fill ``(16, 16)`` of ``products`` from ``row`` on: 16 pixels of flat maps from ``first``, by pixels of a patch.
 
-    ``pairs`` holds the features of patches, from ``second``. All arrays are contiguous.
+    ``tiles`` holds the features of patches, from ``second``. All arrays are contiguous.
     """
 
     def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
@@ -88,7 +88,7 @@ def _row_of_products(context, maps, first, pairs, second, channels, products, ro
         _unit(builder, "tilestored64", [_tile(_SUMS), at(5, given[6]), line])
         return target.get_dummy_value()
 
-    return types.void(maps, types.intp, pairs, types.intp, types.intp, products, types.intp), generate
+    return types.void(maps, types.intp, tiles, types.intp, types.intp, products, types.intp), generate
 
 
 def _vector(builder: Any, address: Any, element: Any) -> Any:
@@ -145,23 +145,15 @@ def _move_to(context, products, first, step, shares, bits):
 
 
 @part
-def _rounded(value):
-    """Bits of bfloat16 nearest to a number, ties to even."""
-    bits = np.float32(value).view(np.uint32)
-    return np.uint16((bits + np.uint32(0x7FFF) + ((bits >> np.uint32(16)) & np.uint32(1))) >> np.uint32(16))
-
-
-@part
-def _paired(features):
-    """Features ``(K, q, C)`` as tiles ``(K, C / 32, 16 pairs of channels, 16 pixels)``, two bfloat16 in a uint32."""
-    patches, pixels, channels = features.shape
-    pairs = np.zeros((patches, channels // 2, SIDE), np.uint32)
+def _tiles(features):
+    """Features ``(K, q, C / 2)``, pairs of channels, as tiles ``(K, C / 32, 16 pairs, 16 pixels)``."""
+    patches, pixels, pairs = features.shape
+    tiles = np.zeros((patches, pairs, SIDE), np.uint32)
     for k in range(patches):
         for pixel in range(pixels):
-            for c in range(channels // 2):
-                low, high = _rounded(features[k, pixel, 2 * c]), _rounded(features[k, pixel, 2 * c + 1])
-                pairs[k, c, pixel] = np.uint32(low) | (np.uint32(high) << np.uint32(16))
-    return pairs.reshape(-1)
+            for pair in range(pairs):
+                tiles[k, pair, pixel] = features[k, pixel, pair]
+    return tiles.reshape(-1)
 
 
 @part
@@ -199,13 +191,13 @@ def correlate(maps, features, at, kk, order, frames, radius, out):
     """Fill ``out (E, q, 2r+1, 2r+1)``, bits of bfloat16 as uint16.
 
     The other arguments are those of the twin: ``maps (N, H, W, C)`` as bits, with at least 16 columns and a multiple of
-    32 channels, ``features`` in float32 of at most 16 pixels, and the radius at most 3. ``order (E,)`` is that of the
-    edges: those into a frame after each other read its map from a near cache.
+    32 channels, ``features (K, q, C / 2)`` of at most 16 pixels as the bits of two channels in a uint32, and the radius
+    at most 3. ``order (E,)`` is that of the edges: those into a frame after each other read its map from a near cache.
     """
     side, taps = 2 * radius + 1, 2 * radius + 2
     _, height, width, channels = maps.shape
     pixels = at.shape[1]
-    flat, pairs = maps.reshape(-1), _paired(features)
+    flat, tiles = maps.reshape(-1), _tiles(features)
     shapes = np.zeros(64, np.uint8)
     shapes[0] = 1
     for tile in range(3):
@@ -237,7 +229,7 @@ def correlate(maps, features, at, kk, order, frames, radius, out):
             column, rows = min(first_left, width - SIDE), last_top - first_top + taps
             for row in range(rows):
                 where = begin + ((first_top + row) * width + column) * channels
-                _row_of_products(flat, where, pairs, second, channels, products, row * SIDE * SIDE)
+                _row_of_products(flat, where, tiles, second, channels, products, row * SIDE * SIDE)
             _blend(products, rows, last_left - column + taps, fx, fy, bits)
             for pixel in range(0 if together else turn, pixels if together else turn + 1):
                 if lefts[pixel] >= 0:

@@ -188,10 +188,9 @@ def _weights_of_levels(layer: nn.Linear, correlation: Correlation, taps: int) ->
     """Weights of a first layer for each level."""
     weight, count = layer.weight, len(correlation.levels)
     records = torch.is_grad_enabled() and weight.requires_grad
-    if records or is_transformed() or torch.jit.is_tracing():
+    if records or weight.is_inference() or is_transformed() or torch.jit.is_tracing():  # or has no version
         return _ordered(weight, count, correlation.order, taps)
-    version = 0 if weight.is_inference() else weight._version
-    made_of = weight.data_ptr(), version, count, correlation.order
+    made_of = weight.data_ptr(), weight._version, count, correlation.order
     found = _ORDERED.get(layer)
     if found is None or found[0] != made_of:
         found = made_of, tuple(x.contiguous() for x in _ordered(weight, count, correlation.order, taps))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dvo.core.errors import DvoError
-from dvo.core.kernels import CHOICES, VARIABLE
+from dvo.core.kernels import CHOICES, VARIABLE, available
 from dvo.nets.correlation.correlation import CorrelationVolume, correlate_reference
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation
 from dvo.nets.patch.patchifier import pool_levels
@@ -189,6 +189,7 @@ def test_kernel_of_training_equals_volume(
             torch.testing.assert_close(x, y, rtol=1e-4, atol=1e-5 * float(y.abs().max()) + 1e-6)
 
 
+@pytest.mark.skipif(not available(), reason="kernels are not wanted")
 @pytest.mark.parametrize(("name", "value"), [("kk", 4), ("jj", 3), ("jj", -1), ("learn", 5)])
 def test_kernel_of_training_reads_nothing_beside_the_arrays(name, value):
     given = {"kk": torch.arange(4), "jj": torch.tensor([0, 1, 2, 0]), "learn": torch.arange(2)}

@@ -80,6 +80,25 @@ class Sensors:
     from_body: Tensor
 
 
+DEPTH_RANGE = (1e-3, 10.0)
+"""Inverse depths in bundle adjustment, where the median of a scene is about 1."""
+NEARER = 2.5
+"""Factor of the median of nearer scenes up to which they may be."""
+
+
+def depth_range_of(median: float) -> tuple[float, float]:
+    """Range of inverse depths: :data:`DEPTH_RANGE`, or wider where a scene has come nearer.
+
+    The unit of a trajectory is set by its first images. Where a camera goes on from a hall to a wall at arm's length,
+    nearly all inverse depths would meet the usual bound, and nothing would fit any more.
+
+    Args:
+        median: of the inverse depths of a scene.
+    """
+    low, high = DEPTH_RANGE
+    return low, max(high, NEARER * median)
+
+
 @dataclass(frozen=True)
 class BAOptions:
     """Options of :func:`dvo.ba.layer.layer.bundle_adjust`.
@@ -114,7 +133,7 @@ class BAOptions:
     motion_only: bool = False
     bounds: tuple[float, float] | None = None
     max_residual: float = 128.0
-    depth_range: tuple[float, float] = (1e-3, 10.0)
+    depth_range: tuple[float, float] = DEPTH_RANGE
     kernel: Kernel = Kernel()  # noqa: RUF009 (frozen)
     refine_intrinsics: Refine = "none"
     sensors: Sensors | None = None

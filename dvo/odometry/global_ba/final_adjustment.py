@@ -17,6 +17,7 @@ from torch import Tensor
 
 from dvo.ba.kernels import Kernel
 from dvo.ba.multistart import DEPTH_STARTS, PRESENT, RESTARTS, multistart, preferred, present
+from dvo.ba.options import depth_range_of
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.solve import solve
 from dvo.ba.sparse.global_adjust import GlobalBAOptions
@@ -321,7 +322,8 @@ def solve_part(
         return poses_cw, depths, cost
     part = part.with_values(poses_cw=poses_cw, inverse_depths=depths.flatten())
     solver = LMOptions(max_iterations=options.iterations, tolerance=options.tolerance)
+    limits = depth_range_of(float(depths.median(1).values.max()))  # of the keyframe of the nearest scene
     for kernel in options.kernels:
-        found = solve(part, GlobalBAOptions(fixed, kernel, options.max_residual, solver=solver))
+        found = solve(part, GlobalBAOptions(fixed, kernel, options.max_residual, limits, solver=solver))
         part, cost = part.with_values(poses_cw=se3.normalise(found.poses_cw), patches=found.patches), found.cost
     return part.poses_cw, part.inverse_depths.reshape_as(depths), cost

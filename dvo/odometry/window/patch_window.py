@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
-from dvo.ba.options import BADamping, BAOptions
+from dvo.ba.options import DEPTH_RANGE, BADamping, BAOptions, depth_range_of
 from dvo.ba.problem import Factor
 from dvo.core.context import multiplies_bfloat16
 from dvo.map.edges import PatchGraph
@@ -374,8 +374,9 @@ class PatchWindow:
         factors += [factor for sensor in self.sensors for factor in sensor.factors(self.window)]
         blocks = {name: block for sensor in self.sensors for name, block in sensor.blocks(self.window).items()}
         options = BAOptions(
-            fixed=fixed, damping=damping, structure_only=structure_only, bounds=self.bounds, kernel=self.settings.kernel
-        )
+            fixed=fixed, damping=damping, structure_only=structure_only, bounds=self.bounds,
+            kernel=self.settings.kernel, depth_range=self._depth_range(),
+        )  # fmt: skip
         after = step(self.model, self.state(), self.correlation, options, factors=tuple(factors), blocks=blocks)
         assert after.targets is not None and after.confidence is not None
         window = self.window
@@ -385,3 +386,11 @@ class PatchWindow:
         for name, values in after.states.items():
             for frame, value in zip(window.frames, values[0], strict=True):
                 frame.states[name] = value
+
+    def _depth_range(self) -> tuple[float, float]:
+        """Range of inverse depths; the usual one on other devices than a CPU, which would be waited for."""
+        patches = self.window.patches
+        if self.device.type != "cpu" or not len(patches):
+            return DEPTH_RANGE
+        middle = patches.shape[-1] // 2
+        return depth_range_of(float(patches[:, 2, middle, middle].median()))

@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
+from dvo.ba.options import DEPTH_RANGE, depth_range_of
 from dvo.odometry.frames.front_end import View, observe
 from dvo.odometry.patch.initial_pose import first_depth
 from dvo.odometry.window.patch_window import PatchWindow, Round
@@ -104,3 +105,21 @@ def test_policies_follow_the_settings():
     assert policies["retry"].rounds == policies["late"].rounds == (Round(5, 0.3),)
     assert (policies["retry"].later, policies["late"].later) == (0, 1) and not policies["located"].checked
     assert all((one.lifetime, one.optimised) == (4, 4) for one in policies.values())
+
+
+@torch.inference_mode()
+def test_a_scene_that_has_come_near_is_not_held_at_the_usual_bound():
+    """The same window in another unit, in which its patches are thirty times as near."""
+    odometry = tracker()
+    for frame in frames(COUNT):
+        odometry.track(frame)
+    window = odometry.window
+    before = window.patches[:, 2, 1, 1].clone()
+    factor = 30.0 / float(before.median())
+    poses, patches = window.poses_cw.clone(), window.patches.clone()
+    poses[:, :3] /= factor
+    patches[:, 2] *= factor
+    window.poses_cw, window.patches = poses, patches
+    odometry.patch_window.update(odometry.config.optimisation)
+    assert float(window.patches[:, 2, 1, 1].median()) > 20.0
+    assert depth_range_of(2.0) == DEPTH_RANGE and depth_range_of(30.0) == (DEPTH_RANGE[0], 75.0)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.limits import LARGEST, LARGEST_TURN, SHORTEST_FOCAL
+from dvo.ba.limits import DEPTH_RANGE, LARGEST, LARGEST_TURN, SHORTEST_FOCAL
 from dvo.core.errors import DvoError
 from dvo.core.settings import shown
 from dvo.geometry import se3, sim3, so3
@@ -197,7 +197,7 @@ def sim3_block(sims: Tensor, fixed: int | Tensor | Sequence[bool] = 1, held: boo
 
 
 def inverse_depth_block(
-    inverse_depths: Tensor, limits: tuple[float, float] = (1e-3, 10.0), held: bool = False
+    inverse_depths: Tensor, limits: tuple[float, float] = DEPTH_RANGE, held: bool = False
 ) -> StateBlock:
     """Inverse depths ``(B, K)``, kept within ``limits`` after each step; the eliminated block."""
 

@@ -11,3 +11,21 @@ RETRIES = 6
 """Attempts after a failed factorisation, each with ten times the damping."""
 LARGEST_TURN = 10.0
 """Largest step of the logarithm of a focal length, or of a principal point in focal lengths."""
+DEPTH_RANGE = (1e-3, 10.0)
+"""Inverse depths in bundle adjustment, where the median of a scene is about 1."""
+NEARER = 2.5
+"""Factor of the median of nearer scenes up to which they may be."""
+
+
+def depth_range_of(median: float, usual: tuple[float, float] = DEPTH_RANGE) -> tuple[float, float]:
+    """Range of inverse depths: the usual one, or wider where a scene has come nearer.
+
+    The unit of a trajectory is set by its first images. Where a camera goes on from a hall to a wall at arm's length,
+    nearly all inverse depths would meet the usual bound, and nothing would fit any more.
+
+    Args:
+        median: of the inverse depths of a scene.
+        usual: smallest and largest.
+    """
+    low, high = usual
+    return low, max(high, NEARER * median)

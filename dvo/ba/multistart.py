@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
+from dvo.ba.limits import depth_range_of
 from dvo.ba.options import BAOptions, damping_at
 from dvo.ba.patch_problem import KERNEL, MAX_RESIDUAL, PatchProblem
 from dvo.ba.solve import solve
@@ -94,7 +95,8 @@ def multistart(
     Args:
         problem: one graph. It is solved on the CPU in double precision, which not every accelerator has.
         starts: by name; that of the present values, if they are one, is :data:`PRESENT`.
-        options: of each solution. Without iterations the starts are ranked as they are.
+        options: of each solution; their range of depths is widened for a near scene. Without iterations the starts are
+            ranked as they are.
         abandon: see :data:`ABANDON`.
         beside: gives a part of the starts to another thread, with the same solutions; None to take all here.
 
@@ -106,6 +108,9 @@ def multistart(
         >>> best = preferred(found)
     """
     problem = problem.exact()
+    if len(problem.inverse_depths):
+        median = float(problem.inverse_depths.median())
+        options = replace(options, depth_range=depth_range_of(median, options.depth_range))
 
     def solved(name: str, now: PatchProblem, iterations: int) -> Solution:
         steps = replace(options.solver, max_iterations=iterations)

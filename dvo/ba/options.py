@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dvo.ba.checks import check_number, check_positive, check_range, check_size, check_switch, check_whole
 from dvo.ba.kernels import Kernel
-from dvo.ba.limits import LARGEST
+from dvo.ba.limits import DEPTH_RANGE, LARGEST
 from dvo.core.errors import DvoError
 from dvo.core.settings import shown
 
@@ -78,25 +78,6 @@ class Sensors:
     source: Tensor
     target: Tensor
     from_body: Tensor
-
-
-DEPTH_RANGE = (1e-3, 10.0)
-"""Inverse depths in bundle adjustment, where the median of a scene is about 1."""
-NEARER = 2.5
-"""Factor of the median of nearer scenes up to which they may be."""
-
-
-def depth_range_of(median: float) -> tuple[float, float]:
-    """Range of inverse depths: :data:`DEPTH_RANGE`, or wider where a scene has come nearer.
-
-    The unit of a trajectory is set by its first images. Where a camera goes on from a hall to a wall at arm's length,
-    nearly all inverse depths would meet the usual bound, and nothing would fit any more.
-
-    Args:
-        median: of the inverse depths of a scene.
-    """
-    low, high = DEPTH_RANGE
-    return low, max(high, NEARER * median)
 
 
 @dataclass(frozen=True)

@@ -103,6 +103,18 @@ def test_a_problem_is_solved_from_nothing(seed):
     assert rotation_error(best.problem, moved) < 0.02
 
 
+@pytest.mark.parametrize("start", RESTARTS)
+def test_a_near_scene_keeps_its_depths(start):
+    """The same problem in another unit, in which it is thirty times as near: the usual bound would hold all depths."""
+    poses, problem = scene(0)
+    near = poses.clone()
+    near[:, :3] /= 30
+    there = problem.with_values(poses_cw=near, inverse_depths=30 * problem.inverse_depths)
+    found, usual = (solved_from(given, start).problem.inverse_depths for given in (there, problem))
+    assert float(found.median()) == pytest.approx(30 * float(usual.median()), rel=0.05)
+    assert float(found.max()) > 30.0
+
+
 def test_a_solution_has_to_be_clearly_better():
     _, problem = scene(0)
     costs = {PRESENT: 1.0, "a": 0.96, "b": 2.0}

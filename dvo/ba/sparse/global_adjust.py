@@ -27,7 +27,7 @@ from dvo.ba.blocks import (
 from dvo.ba.checks import REAL, WHOLE, check_kind, check_positive, check_range, check_switch, check_tensor, check_within
 from dvo.ba.edges import check_index, plan_edges
 from dvo.ba.kernels import Kernel
-from dvo.ba.limits import HEAVIEST, LARGEST, SHORTEST_FOCAL
+from dvo.ba.limits import DEPTH_RANGE, HEAVIEST, LARGEST, SHORTEST_FOCAL
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, State, StateBlock, check_further
 from dvo.ba.sparse.block_parts import PART, BlockParts
@@ -61,7 +61,7 @@ class GlobalBAOptions:
     fixed: int | Tensor | Sequence[bool] = 1
     kernel: Kernel = field(default_factory=lambda: Kernel("huber", 2.0))
     max_residual: float = 128.0
-    depth_range: tuple[float, float] = (1e-3, 10.0)
+    depth_range: tuple[float, float] = DEPTH_RANGE
     move_poses: bool = True
     move_depths: bool = True
     solver: LMOptions = field(default_factory=lambda: LMOptions(max_iterations=20))

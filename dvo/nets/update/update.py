@@ -322,4 +322,8 @@ class Update(nn.Module):
         net = net + self.agg_kk(net, graph.by_patch)
         net = net + self.agg_ij(net, graph.by_pair)
         net = self.gru(net)
-        return net.to(hidden.dtype), self.d(net).to(hidden.dtype), self.w(net).to(hidden.dtype)
+        revised = net, self.d(net), self.w(net)
+        if dtype == hidden.dtype:  # autocast gives what it computed
+            return revised
+        state, delta, confidence = (x.to(hidden.dtype) for x in revised)
+        return state, delta, confidence

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
+from dvo.ba.limits import depth_range_of
 from dvo.ba.multistart import DEPTH_STARTS, PRESENT, RESTARTS, multistart, preferred, present
-from dvo.ba.options import depth_range_of
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.solve import solve
 from dvo.ba.sparse.global_adjust import GlobalBAOptions

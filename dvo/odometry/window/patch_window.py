@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
-from dvo.ba.options import DEPTH_RANGE, BADamping, BAOptions, depth_range_of
+from dvo.ba.limits import DEPTH_RANGE, depth_range_of
+from dvo.ba.options import BADamping, BAOptions
 from dvo.ba.problem import Factor
 from dvo.core.context import multiplies_bfloat16
 from dvo.map.edges import PatchGraph
@@ -388,9 +389,9 @@ class PatchWindow:
                 frame.states[name] = value
 
     def _depth_range(self) -> tuple[float, float]:
-        """Range of inverse depths; the usual one on other devices than a CPU, which would be waited for."""
+        """Range of inverse depths of the present scene; an accelerator is waited for."""
         patches = self.window.patches
-        if self.device.type != "cpu" or not len(patches):
+        if not len(patches):
             return DEPTH_RANGE
         middle = patches.shape[-1] // 2
         return depth_range_of(float(patches[:, 2, middle, middle].median()))

@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from dvo.ba.options import DEPTH_RANGE, depth_range_of
+from dvo.ba.limits import DEPTH_RANGE, depth_range_of
 from dvo.odometry.frames.front_end import View, observe
 from dvo.odometry.patch.initial_pose import first_depth
 from dvo.odometry.window.patch_window import PatchWindow, Round

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
+from functools import cache
 from typing import Any, TypeVar
 
 import llvmlite.binding
@@ -86,6 +87,7 @@ def load_kept(kernel: Any, types: str) -> None:
             kernel.add_overload(found)
 
 
+@cache
 def has_matrix_units() -> bool:
     """Tell if kernels are compiled for a CPU with matrix units for bfloat16 (Intel's AMX), which no others may use."""
     another = any(getattr(config, name, None) for name in ("CPU_NAME", "CPU_FEATURES"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Iterator
-from functools import wraps
+from functools import cache, wraps
 from typing import ParamSpec, TypeVar
 
 import numpy as np
@@ -90,6 +90,7 @@ def full_precision(device: torch.device) -> Iterator[None]:
             setattr(matmul, name, before)
 
 
+@cache
 def multiplies_bfloat16(device: torch.device) -> bool:
     """Tell if a device is a CPU with units for matrix products of bfloat16, which are several times as fast there.
 

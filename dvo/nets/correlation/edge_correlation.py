@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from dvo.core.context import multiplies_bfloat16
 from dvo.core.kernels import use_device_kernels, use_kernels
 
 # Map slots that memory is reserved for at first, on a CPU and on other devices. On a CPU a page takes memory once it is
@@ -110,19 +111,18 @@ class EdgeCorrelation:
 
     def _lookup_tiled(self, at: Tensor, features: Tensor, kk: Tensor, frames: Tensor) -> Tensor:
         """Look-up in maps of bfloat16."""
-        if use_kernels(features, at) and fits_tiles(features.shape[2], features.shape[1], self.radius):
+        tiled = fits_tiles(features.shape[2], features.shape[1], self.radius)
+        if use_kernels(features, at) and tiled and multiplies_bfloat16(at.device):
             from dvo.core.compiled import has_matrix_units
+            from dvo.nets.correlation.edge_correlation_kernels import correlate_bfloat16
 
             if has_matrix_units():
-                from dvo.nets.correlation.edge_correlation_tile_kernels import correlate
-
                 side = 2 * self.radius + 1
                 out = torch.empty(*at.shape[:2], side, side, dtype=torch.bfloat16)
-                into = frames.numpy()
                 pairs = features.bfloat16().contiguous().view(torch.uint16).numpy().view(np.uint32)
-                correlate(
-                    self.maps.view(torch.uint16).numpy(), pairs, at.numpy(), kk.numpy(),
-                    np.argsort(into, kind="stable"), into, self.radius, out.view(torch.uint16).numpy(),
+                correlate_bfloat16(
+                    self.maps.view(torch.uint16).numpy(), pairs, at.numpy(), kk.numpy(), frames.numpy(), self.radius,
+                    out.view(torch.uint16).numpy(),
                 )  # fmt: skip
                 return out
         rounded = features.bfloat16().float()

@@ -86,8 +86,8 @@ KERNELS = {
 """Kernels in the order in which a run needs them, each with the types of its arguments."""
 MATRIX_KERNELS = {
     "dvo.nets.patch.encoder_kernels:normalise_bfloat16": "u2[:,:,::1], f8, b1, u2[:,:,::1]",
-    "dvo.nets.correlation.edge_correlation_tile_kernels:correlate": (
-        "u2[:,:,:,::1], u4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8[::1], i8, u2[:,:,:,::1]"
+    "dvo.nets.correlation.edge_correlation_kernels:correlate_bfloat16": (
+        "u2[:,:,:,::1], u4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, u2[:,:,:,::1]"
     ),
 }
 """Those of a CPU with matrix units, which come first there."""

@@ -1,5 +1,6 @@
 """Look-up in maps of bfloat16: the twin everywhere, and the kernel where the CPU has matrix units."""
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -55,15 +56,79 @@ def test_channels_are_those_of_single_precision_rounded(kernels, channels, radiu
 
 @tiled
 def test_the_kernel_serves_the_sizes_of_the_default_network(monkeypatch):
-    from dvo.nets.correlation import edge_correlation_tile_kernels
+    from dvo.nets.correlation import edge_correlation_kernels
 
     calls = []
-    kernel = edge_correlation_tile_kernels.correlate
-    monkeypatch.setattr(edge_correlation_tile_kernels, "correlate", lambda *given: calls.append(kernel(*given)))
+    kernel = edge_correlation_kernels.correlate_bfloat16
+    monkeypatch.setattr(edge_correlation_kernels, "correlate_bfloat16", lambda *given: calls.append(kernel(*given)))
     filled(64, 3, torch.bfloat16).lookup(*edges(64, 3, 1.0, 0))
     assert len(calls) == 1 and fits_tiles(64, 9, 3)
     filled(48, 3, torch.bfloat16).lookup(*edges(48, 3, 1.0, 0))
     assert len(calls) == 1 and not fits_tiles(48, 9, 3)
+
+
+class Units:
+    """Instructions of matrix units in NumPy, each as the intrinsic of its name."""
+
+    @staticmethod
+    def _configure(shapes):
+        assert shapes[0] == 1 and set(shapes[48:51]) == {16}
+
+    @staticmethod
+    def _release(): ...
+
+    @staticmethod
+    def _row_of_products(maps, first, tiles, second, channels, products, row):
+        pixels = numbers(maps[first : first + 16 * channels]).reshape(16, channels)
+        pairs = tiles[second : second + 8 * channels].view(np.uint16).reshape(channels // 2, 16, 2)
+        features = numbers(pairs).transpose(0, 2, 1).reshape(channels, 16)
+        products[row : row + 256] = (pixels @ features).ravel()
+
+    @staticmethod
+    def _move(products, first, step, shares):
+        here, beyond = products[first : first + 16], products[first + step : first + step + 16]
+        here += shares * (beyond - here)
+
+    @staticmethod
+    def _move_to(products, first, step, shares, bits):
+        Units._move(products, first, step, shares)
+        bits[first : first + 16] = torch.tensor(products[first : first + 16]).bfloat16().view(torch.uint16).numpy()
+
+
+def numbers(bits):
+    return (bits.astype(np.uint32) << 16).view(np.float32)
+
+
+@pytest.mark.skipif(not available(), reason="no kernels")
+@pytest.mark.parametrize(("radius", "side", "spread"), [(3, 3, 1.0), (2, 3, 9.0), (3, 1, 0.0)])
+def test_what_the_kernel_asks_of_the_units(radius, side, spread, monkeypatch):
+    """Its loops as Python runs them, on any CPU."""
+    from dvo.nets.correlation import edge_correlation_kernels as kernels
+
+    given = edges(32, side, spread, 0, count=8)
+    expected = filled(32, radius, torch.float32).lookup(*given)  # compiled before its parts are replaced
+    for name in ("_tiles", "_corner", "_by_frame", "_blend_tiles", "_take"):
+        monkeypatch.setattr(kernels, name, getattr(kernels, name).py_func)
+    for name in ("_configure", "_release", "_row_of_products", "_move", "_move_to"):
+        monkeypatch.setattr(kernels, name, getattr(Units, name))
+    monkeypatch.setattr(kernels, "correlate_bfloat16", kernels.correlate_bfloat16.py_func)
+    level = filled(32, radius, torch.bfloat16)
+    for module, name in (
+        ("nets.correlation.edge_correlation", "multiplies_bfloat16"),
+        ("core.compiled", "has_matrix_units"),
+    ):
+        monkeypatch.setattr(f"dvo.{module}.{name}", lambda *_: True)
+    monkeypatch.setattr("dvo.nets.correlation.edge_correlation.correlate_edges", None)
+    found = level.lookup(*given)
+    torch.testing.assert_close(found.float(), expected, rtol=2**-8, atol=1e-4, equal_nan=True)
+
+
+def test_units_are_used_with_permission_alone(monkeypatch):
+    """A CPU may have them, and the operating system not give them."""
+    monkeypatch.setattr("dvo.core.compiled.has_matrix_units", lambda: True)
+    monkeypatch.setattr("dvo.nets.correlation.edge_correlation.multiplies_bfloat16", lambda device: False)
+    given = edges(64, 3, 1.0, 0)
+    assert filled(64, 3, torch.bfloat16).lookup(*given).dtype == torch.bfloat16
 
 
 @tiled

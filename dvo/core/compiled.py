@@ -88,10 +88,14 @@ def load_kept(kernel: Any, types: str) -> None:
 
 
 @cache
-def has_matrix_units() -> bool:
-    """Tell if kernels are compiled for a CPU with matrix units for bfloat16 (Intel's AMX), which no others may use."""
+def compiled_for(feature: str) -> bool:
+    """Tell if kernels are compiled for this CPU, and it has some instructions, which no others may use.
+
+    Args:
+        feature: LLVM's name of them, ``amx-bf16`` or ``avx512bf16``.
+    """
     another = any(getattr(config, name, None) for name in ("CPU_NAME", "CPU_FEATURES"))
-    return not another and bool(llvmlite.binding.get_host_cpu_features().get("amx-bf16"))
+    return not another and bool(llvmlite.binding.get_host_cpu_features().get(feature))
 
 
 def name_of(function: Callable[..., Any]) -> str:

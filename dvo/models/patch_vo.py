@@ -90,8 +90,8 @@ class PatchVO(nn.Module):
     def in_bfloat16(self) -> PatchVO:
         """Copy for inference that multiplies in bfloat16, several times as fast on processors that have units for it.
 
-        Inputs and outputs are float32, as are correlation, bundle adjustment and update operators of other kinds than
-        the gated one.
+        Inputs and outputs are float32, as are bundle adjustment and update operators of other kinds than the gated one.
+        A tracker's correlation is in bfloat16 too where the processor has such units.
 
         Returns:
             The copy, in evaluation mode; parameters are rounded.

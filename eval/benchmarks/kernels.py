@@ -2,7 +2,8 @@
 
 Prints for each kernel a line: size, milliseconds of the kernel and of its PyTorch twin on one thread (medians of
 ``--repeats`` runs that take turns, so that a busy machine slows both), the ratio, and the largest difference of the
-results. The lines of ``bfloat16`` have the network in that precision, and in float32 in the place of the twin.
+results. The lines of ``bfloat16`` have the network in that precision, and in float32 in the place of the twin; without
+matrix units the tracker looks up in float32, and that line is left out.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from dvo.ba.solve import solve
 from dvo.ba.sparse.global_adjust import GlobalBAOptions
 from dvo.ba.sparse.levenberg import LMOptions
 from dvo.core.command_line import OneLineParser
+from dvo.core.context import multiplies_tiles
 from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.models.patch_vo import PatchVO
 from dvo.models.schedule import full_graph
@@ -210,7 +212,8 @@ def main() -> None:
     parser.add_argument("--only", default="", help="kernels whose names contain this")
     parser.add_argument("--repeats", type=int, default=20, help="(%(default)s)")
     options = parser.parse_args()
-    names = (*KERNELS, *PRECISIONS)
+    left_out = set() if multiplies_tiles(CPU) else {"correlation, bfloat16"}
+    names = [name for name in (*KERNELS, *PRECISIONS) if name not in left_out]
     chosen = [name for name in names if options.only in name]
     if not chosen or options.repeats < 1:
         parser.error(f"no run: --only is part of {', '.join(names)}, --repeats at least 1")
@@ -218,7 +221,7 @@ def main() -> None:
     print(f"{'kernel':24} {'size':28} {'ms':>8} {'twin ms':>8} {'ratio':>6} {'difference':>11}")
     with torch.inference_mode():
         for name in chosen:
-            generator = torch.Generator().manual_seed(0)
+            generator = torch.manual_seed(0)  # also of untrained networks
             if name in KERNELS:
                 size, call = KERNELS[name](generator, CPU)
                 kernel, twin, largest = compare(call, options.repeats, CPU)

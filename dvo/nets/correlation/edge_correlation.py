@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dvo.core.context import multiplies_bfloat16
+from dvo.core.context import multiplies_tiles
 from dvo.core.kernels import use_device_kernels, use_kernels
 
 # Map slots that memory is reserved for at first, on a CPU and on other devices. On a CPU a page takes memory once it is
@@ -112,11 +112,11 @@ class EdgeCorrelation:
     def _lookup_tiled(self, at: Tensor, features: Tensor, kk: Tensor, frames: Tensor) -> Tensor:
         """Look-up in maps of bfloat16."""
         tiled = fits_tiles(features.shape[2], features.shape[1], self.radius)
-        if use_kernels(features, at) and tiled and multiplies_bfloat16(at.device):
-            from dvo.core.compiled import has_matrix_units
+        if use_kernels(features, at) and tiled and multiplies_tiles(at.device):
+            from dvo.core.compiled import compiled_for
             from dvo.nets.correlation.edge_correlation_kernels import correlate_bfloat16
 
-            if has_matrix_units():
+            if compiled_for("amx-bf16"):
                 side = 2 * self.radius + 1
                 out = torch.empty(*at.shape[:2], side, side, dtype=torch.bfloat16)
                 pairs = features.bfloat16().contiguous().view(torch.uint16).numpy().view(np.uint32)

@@ -29,7 +29,7 @@ C = TypeVar("C", bound="DataclassInstance")
 Policy = Literal["continuous", "retry", "late", "located"]
 """What a frame follows that is tried in the window."""
 Precision = Literal["auto", "float32", "bfloat16"]
-"""Type of the numbers that the network multiplies; ``auto``: bfloat16 on a CPU with units for it (Intel's AMX)."""
+"""Type of the numbers that the network multiplies; ``auto``: bfloat16 on a CPU with instructions for it."""
 InitialPose = Literal["motion", "nearest"]
 """First pose of a new frame: of the motion model, or from matches with the newest keyframe."""
 

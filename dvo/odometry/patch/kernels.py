@@ -84,20 +84,23 @@ KERNELS = {
     ),
 }
 """Kernels in the order in which a run needs them, each with the types of its arguments."""
-MATRIX_KERNELS = {
-    "dvo.nets.patch.encoder_kernels:normalise_bfloat16": "u2[:,:,::1], f8, b1, u2[:,:,::1]",
-    "dvo.nets.correlation.edge_correlation_kernels:correlate_bfloat16": (
-        "u2[:,:,:,::1], u4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, u2[:,:,:,::1]"
-    ),
+OF_PROCESSORS = {
+    "avx512bf16": {"dvo.nets.patch.encoder_kernels:normalise_bfloat16": "u2[:,:,::1], f8, b1, u2[:,:,::1]"},
+    "amx-bf16": {
+        "dvo.nets.correlation.edge_correlation_kernels:correlate_bfloat16": (
+            "u2[:,:,:,::1], u4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, u2[:,:,:,::1]"
+        )
+    },
 }
-"""Those of a CPU with matrix units, which come first there."""
+"""Those of processors with some instructions, see :func:`dvo.core.compiled.compiled_for`; they come first there."""
 
 
 def needed() -> dict[str, str]:
     """Kernels of this machine, see :data:`KERNELS`."""
-    from dvo.core.compiled import has_matrix_units
+    from dvo.core.compiled import compiled_for
 
-    return MATRIX_KERNELS | KERNELS if has_matrix_units() else KERNELS
+    own = [kernels for feature, kernels in OF_PROCESSORS.items() if compiled_for(feature)]
+    return {name: types for kernels in (*own, KERNELS) for name, types in kernels.items()}
 
 
 @cache

@@ -14,7 +14,7 @@ from dvo.ba.kernels import Kernel
 from dvo.ba.limits import DEPTH_RANGE, depth_range_of
 from dvo.ba.options import BADamping, BAOptions
 from dvo.ba.problem import Factor
-from dvo.core.context import multiplies_bfloat16
+from dvo.core.context import multiplies_tiles
 from dvo.map.edges import PatchGraph
 from dvo.map.measurements import depth_factors
 from dvo.map.window import Keyframe, Window, WindowSnapshot
@@ -119,7 +119,7 @@ class WindowCorrelation:
         config = model.config
         self.window, self.pyramid = window, config.pyramid
         tiled = fits_tiles(config.feature_channels, config.patch_size**2, config.radius)
-        half = model.precision == torch.bfloat16 and tiled and multiplies_bfloat16(device)
+        half = model.precision == torch.bfloat16 and tiled and multiplies_tiles(device)
         dtype = torch.bfloat16 if half else torch.float32
         self.levels = [EdgeCorrelation(scale, config.radius, device, dtype) for scale in config.pyramid]
 

@@ -6,14 +6,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dvo.core.compiled import has_matrix_units
-from dvo.core.context import multiplies_bfloat16
+from dvo.core.compiled import compiled_for
+from dvo.core.context import multiplies_tiles
 from dvo.core.kernels import available
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation, fits_tiles
 
 CPU = torch.device("cpu")
 tiled = pytest.mark.skipif(
-    not (available() and has_matrix_units() and multiplies_bfloat16(CPU)), reason="no matrix units, or no kernels"
+    not (available() and compiled_for("amx-bf16") and multiplies_tiles(CPU)), reason="no matrix units, or no kernels"
 )
 
 
@@ -113,11 +113,8 @@ def test_what_the_kernel_asks_of_the_units(radius, side, spread, monkeypatch):
         monkeypatch.setattr(kernels, name, getattr(Units, name))
     monkeypatch.setattr(kernels, "correlate_bfloat16", kernels.correlate_bfloat16.py_func)
     level = filled(32, radius, torch.bfloat16)
-    for module, name in (
-        ("nets.correlation.edge_correlation", "multiplies_bfloat16"),
-        ("core.compiled", "has_matrix_units"),
-    ):
-        monkeypatch.setattr(f"dvo.{module}.{name}", lambda *_: True)
+    monkeypatch.setattr("dvo.nets.correlation.edge_correlation.multiplies_tiles", lambda device: True)
+    monkeypatch.setattr("dvo.core.compiled.compiled_for", lambda feature: True)
     monkeypatch.setattr("dvo.nets.correlation.edge_correlation.correlate_edges", None)
     found = level.lookup(*given)
     torch.testing.assert_close(found.float(), expected, rtol=2**-8, atol=1e-4, equal_nan=True)
@@ -125,8 +122,8 @@ def test_what_the_kernel_asks_of_the_units(radius, side, spread, monkeypatch):
 
 def test_units_are_used_with_permission_alone(monkeypatch):
     """A CPU may have them, and the operating system not give them."""
-    monkeypatch.setattr("dvo.core.compiled.has_matrix_units", lambda: True)
-    monkeypatch.setattr("dvo.nets.correlation.edge_correlation.multiplies_bfloat16", lambda device: False)
+    monkeypatch.setattr("dvo.core.compiled.compiled_for", lambda feature: True)
+    monkeypatch.setattr("dvo.nets.correlation.edge_correlation.multiplies_tiles", lambda device: False)
     given = edges(64, 3, 1.0, 0)
     assert filled(64, 3, torch.bfloat16).lookup(*given).dtype == torch.bfloat16
 

@@ -51,6 +51,7 @@ MASK = "mask what moves or is fixed to the camera (--mask), or film so that most
 CALIBRATE = "give a calibration of this camera and this resolution (--calib FILE; dvo calibrate makes one)"
 FILM = "film textured surfaces at a few metres while the camera moves sideways, or use --preset accurate"
 STEADY = "turn electronic stabilisation off"
+SENSOR = "see what `dvo imu check` finds, or leave the samples out (--imu none)"
 MOVE = "move the camera sideways while filming; a tripod or a single picture has no trajectory"
 
 
@@ -174,6 +175,21 @@ def judge(quality: Quality, frames: int, cause: str = "") -> tuple[Verdict, str,
     if quality.jumps > MOST_JUMPS * max(frames / 100, 1):
         return "doubtful", f"the camera jumps {quality.jumps} times", FILM
     return "good", "", ""
+
+
+def without_scale(quality: Quality, reason: str) -> Quality:
+    """Quality of a result in metres by inertial samples, that these do not confirm in the end.
+
+    Args:
+        quality: of the result by its images.
+        reason: why; empty where they do.
+
+    Returns:
+        The same; doubtful where it was good and there is a reason.
+    """
+    if quality.verdict != "good" or not reason:
+        return quality
+    return replace(quality, verdict="doubtful", reason=f"the scale is in doubt: {reason}", remedy=SENSOR)
 
 
 def without_calibration(quality: Quality, guessed: bool = True) -> Quality:

@@ -621,13 +621,16 @@ class InertialEstimator:
                 inf if that finds no solution. None: there is none.
 
         Returns:
-            The estimate; None where there is none that passes the tests, and what was known before stays.
+            The estimate; None where there is none that passes the tests: what was known before stays, and the reason
+            is told.
         """
         if any(world in self.worlds for world in worlds):  # what was lost before the alignment keeps its own world
             first = next(k for k, world in enumerate(worlds) if world in self.worlds)
             nodes, worlds = _chosen(nodes, worlds, nodes.segment >= first)
-        problem, worlds, _ = self._problem(nodes, worlds)
+        end = float(nodes.times[-1]) if len(nodes) else -np.inf
+        problem, worlds, doubt = self._problem(nodes, worlds)
         if problem is None:
+            self.reason = doubt if self.aligned else self.reason
             return None
         if self.solution is None:
             problem.held = 0  # the origin is the place of the first camera
@@ -644,7 +647,7 @@ class InertialEstimator:
                 reason = self._doubt(problem, found)
                 unsure = reason.startswith(_UNCERTAIN) and found.scale_sigma <= LOST_SCALE and confirm is not None
                 if reason and not unsure:
-                    self.reason = self.reason if self.aligned else reason
+                    self.reason = reason
                     return None
                 if not unsure:
                     self.solution, self._known = found, list(worlds)
@@ -655,7 +658,11 @@ class InertialEstimator:
                     self.reason = reason
                     return None
                 self.solution, self._known = found, list(worlds)
-        except (np.linalg.LinAlgError, _DisagreementError):
+        except _DisagreementError as disagreement:
+            self.reason = str(disagreement)
+            return None
+        except np.linalg.LinAlgError:
+            self.reason = "the motion does not tell scale and gravity"
             return None
         assert found is not None
         if not self.aligned:
@@ -664,7 +671,9 @@ class InertialEstimator:
                 {"time": self._aligned, "event": "aligned at the end", "scale_sigma": sigma or found.scale_sigma}
             )
         self._take(found, worlds)
-        self._doubtful, self._failing, self.reason = False, np.inf, ""  # that was of the newest poses
+        self._doubtful, self._failing = False, np.inf  # that was of the newest poses
+        late = end + found.time_offset - self.stream.end
+        self.reason = f"no samples for the last {late:.0f} s" if late > self.options.longest else ""
         return found
 
     # ------------------------------------------------------------------------------------------------------------------

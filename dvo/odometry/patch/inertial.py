@@ -261,6 +261,11 @@ class InertialTracking:
             map=replace(result.map, points=points),
         )  # fmt: skip
 
+    @property
+    def doubt(self) -> str:
+        """Why the scale of poses in metres is in doubt; empty if it is not, and without such poses."""
+        return self.estimator.reason if self.estimator.aligned and not self.metric else ""
+
     def settle(
         self, loops: LoopCloser, adjustment: AdjustmentOptions | None = None, shutter: Shutter | None = None
     ) -> dict[str, Any]:

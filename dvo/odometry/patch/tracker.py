@@ -54,6 +54,7 @@ from dvo.odometry.patch.retry import retry_waiting
 from dvo.odometry.patch.saving import save_map
 from dvo.odometry.patch.state import Phase, TrackerState
 from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.quality import without_scale
 from dvo.odometry.segments import result_of
 from dvo.odometry.uncertainty.uncertainty import LaterUncertainty, WindowMeasurements
 from dvo.odometry.window.frame_alignment import FrameAlignment
@@ -303,6 +304,7 @@ class PatchOdometry:
             found = state.info.get("readout", 0.0)
             rows = replace(state.shutter, readout=readout or (found if isinstance(found, float) else 0.0))
             state.info |= self.inertial.settle(self.loops, together, rows)
+            state.quality = without_scale(state.quality, self.inertial.doubt)
             if readout > 0:
                 state.info |= {"readout": readout, "readout_from": "gyroscope"}
         return replace(self._result({}), quality=state.quality)

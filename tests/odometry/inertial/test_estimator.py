@@ -341,6 +341,28 @@ def test_at_the_end_motion_that_does_not_tell_is_refused() -> None:
     assert not estimator.aligned and "acceleration" in estimator.reason
 
 
+def test_at_the_end_a_recording_that_its_samples_contradict_is_told() -> None:
+    """It was aligned, and the gyroscope is turned afterwards: what was known stays, with the reason."""
+    recording = record(9, seconds=9.0)
+    estimator, _ = drive(recording, until=6.0)
+    assert estimator.aligned and not estimator.reason
+    samples = recording.samples.between(6.0, np.inf)
+    estimator.add(replace(samples, gyro=samples.gyro[:, [1, 0, 2]] + 0.5))
+    before = estimator.worlds[0].scale
+    assert estimator.settle(recording.nodes(0.1, 8.5), [0]) is None
+    assert estimator.aligned and "turn differently" in estimator.reason and estimator.worlds[0].scale == before
+
+
+@pytest.mark.parametrize(("missing", "told"), [(2.0, False), (5.0, True)])
+def test_at_the_end_samples_that_are_missing_for_long_are_told(missing: float, told: bool) -> None:
+    recording = record(9, seconds=6.0 + missing)
+    estimator = InertialEstimator(InertialOptions(longest=3.0))
+    estimator.add(recording.samples.between(-np.inf, 6.0))
+    nodes = recording.nodes(0.1, 5.5 + missing)
+    assert estimator.settle(nodes, [0]) is not None
+    assert bool(estimator.reason) == told and estimator.reason.startswith("no samples" if told else "")
+
+
 def test_at_the_end_a_closer_look_decides_where_the_scale_is_uncertain() -> None:
     recording, asked = record(9, seconds=9.0), []
     options = InertialOptions(max_scale_sigma=2e-4)

@@ -23,6 +23,7 @@ from dvo.odometry.inertial.estimator import Similarity
 from dvo.odometry.inertial.smoother import Smoothed, spaced
 from dvo.odometry.patch.inertial import _led, _runs, _turns_of
 from dvo.odometry.protocol import Estimate, ScaleState, Status
+from dvo.odometry.quality import Quality
 from tests.support.steady_samples import IDENTITY, SPEED, UPRIGHT, align, with_samples
 from tests.support.tiny_tracker import SMALL, frames, plain, tracker
 
@@ -196,6 +197,22 @@ def test_without_a_final_adjustment_there_is_none_with_samples(monkeypatch: pyte
         if k == 9:
             align(odometry, frame.timestamp)
     assert odometry.finish().metric
+
+
+@pytest.mark.parametrize("reason", ["", "samples and images do not fit"])
+def test_metres_that_samples_do_not_confirm_leave_a_doubt(monkeypatch: pytest.MonkeyPatch, reason: str) -> None:
+    odometry = tracker()
+    for k, frame in enumerate(with_samples(frames(14))):
+        odometry.track(frame)
+        if k == 9:
+            align(odometry, frame.timestamp)
+    good = Quality("good", tracked=1.0)
+    monkeypatch.setattr("dvo.odometry.patch.tracker.judge_result", lambda *_: good)
+    monkeypatch.setattr(odometry.inertial.estimator, "settle", lambda *_: None)
+    odometry.inertial.estimator.reason = reason
+    result = odometry.finish()
+    assert result.metric and result.quality is not None
+    assert result.quality.verdict == ("doubtful" if reason else "good") and reason in result.quality.reason
 
 
 @pytest.mark.long

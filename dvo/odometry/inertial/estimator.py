@@ -56,7 +56,7 @@ MAX_GRAVITY_SIGMA = 1.5
 LOST_SCALE = 0.2
 """Relative deviation of the scale above which an alignment is withdrawn, if it lasts for as long as samples alone may
 predict poses; up to it, the adjustment of images and samples may make sure of that of a world that is not aligned."""
-UNSURE_SCALE, SURE_SCALE = 0.1, 0.05
+UNSURE_SCALE, SURE_SCALE = 0.06, 0.04
 """Relative deviation of the scale above which a world in metres is not called aligned, and down to which it is."""
 NOTHING_TOLD = 0.5
 """Relative deviation of the scale above which the motion tells nothing of it."""

@@ -49,6 +49,9 @@ CARRIED, MOST_CARRIED = 15.0, 30.0
 leaves the view to what enters it drifts twice as fast as at rest, and then with its square; and factor at most."""
 LEAST_PARALLAX = 1e-2
 """Rate of parallax, rad/s, below which it is noise: a camera at rest keeps its view, and with it the unit."""
+OUTLIER = 16.0
+"""Squared residual, in variances, that a measurement counts for at most where the noise is estimated: images that were
+wrong for a moment are no noise of all others."""
 USUAL = 10.0
 """Measurements that the usual noise of visual poses counts for, where it is estimated."""
 OPPOSED = -0.5
@@ -787,8 +790,11 @@ def _visual_error(problem: Smoother, values: Values, solved: ChainSolution) -> A
     nodes = np.concatenate([np.delete(np.delete(pairs, second, 1), second, 2), solved.covariance[None]])
     oriented = 1 - _spread(np.concatenate([turns.before, turns.shared], -1), nodes)
     displaced = 1 - _spread(np.concatenate([moves.before, moves.after, moves.shared], -1)[inside], pairs[inside])
-    turned, moved, (rotation, scale) = turns.residual, moves.residual[inside], np.split(steps, [3], axis=1)
-    squares = np.array([(turned**2).sum() + (rotation**2).sum(), (moved**2).sum(), (scale**2).sum()])
+    turned, moved, rotation, scale = (
+        float(np.minimum((rows**2).sum(1), OUTLIER).sum())
+        for rows in (turns.residual, moves.residual[inside], steps[:, :3], steps[:, 3:])
+    )
+    squares = np.array([turned + rotation, moved, scale])
     expected = np.array([oriented.sum() + drifts[:, :3].sum(), displaced.sum(), drifts[:, 3].sum()])
     usual = np.array([options.rotation_factor, options.position_factor, options.scale_factor]) ** -2.0
     return (squares + USUAL * usual) / (np.maximum(expected, 0) + USUAL)

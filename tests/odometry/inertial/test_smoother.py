@@ -158,6 +158,18 @@ def test_a_shift_that_goes_with_a_turn_is_told_by_the_gyroscope(monkeypatch: pyt
     assert errors[0] < errors[1]
 
 
+def test_images_that_were_wrong_for_a_moment_are_no_noise_of_all_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every fifteenth pose is turned by three degrees: less than a tenth of the nodes."""
+    recording, rng = record(5, seconds=8.0), np.random.default_rng(0)
+    wrong = np.zeros((len(recording.times), 3))
+    wrong[::15] = rng.choice([-1, 1], (len(wrong[::15]), 3)) * 0.03
+    seen = replace(recording, rotation=recording.rotation @ so3_exp(wrong))
+    found = solved(seen, 7.0)
+    monkeypatch.setattr(smoother, "OUTLIER", np.inf)
+    apart = solved(seen, 7.0)
+    assert found.visual_error[0] < 5.0 < 100.0 < apart.visual_error[0]
+
+
 def test_images_of_a_fast_turn_count_less(monkeypatch: pytest.MonkeyPatch) -> None:
     """Errors that grow with the square of the angular rate, and poses that are right where the camera is calm."""
     errors: dict[float, list[float]] = {smoother.HASTE: [], 1e9: []}

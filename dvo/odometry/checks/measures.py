@@ -78,7 +78,8 @@ def measure_quality(
     cause = next((found.reason for found in result.breaks if found.reason), "")
     quality = Quality("failed", initialised_at=first, fixed=fixed, jumps=count_jumps(result))
     if len(result.trajectory):
-        quality = replace(quality, tracked=len(result.trajectory) / max(result.frames_read, 1))
+        seen = len(result.trajectory) - int(np.isin(result.trajectory.timestamps, result.inertial).sum())
+        quality = replace(quality, tracked=seen / max(result.frames_read, 1))
     found = [
         part for segment in sorted({graph.world_of(k) for k in segments}) if (part := _inliers(graph, segment, shutter))
     ]

@@ -299,12 +299,12 @@ class PatchOdometry:
             readout = self.inertial.readout
             config = replace(self.config, estimate_readout=self.config.estimate_readout and readout == 0)
             state.info |= finish_segments(self.graph, state, config, self.loops)
-            state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
             together = self.config.adjustment if self.config.final_adjustment else None
             found = state.info.get("readout", 0.0)
             rows = replace(state.shutter, readout=readout or (found if isinstance(found, float) else 0.0))
             state.info |= self.inertial.settle(self.loops, together, rows)
-            state.quality = without_scale(state.quality, self.inertial.doubt)
+            quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
+            state.quality = without_scale(quality, self.inertial.doubt)
             if readout > 0:
                 state.info |= {"readout": readout, "readout_from": "gyroscope"}
         return replace(self._result({}), quality=state.quality)

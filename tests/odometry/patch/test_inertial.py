@@ -17,6 +17,7 @@ from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.geometry import se3, sim3
 from dvo.geometry.poses import rotation_vector, split
+from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.odometry.global_ba.graph_adjustment import Adjusted
 from dvo.odometry.global_ba.inertial_adjustment import VisualInertialSolution as Solution
 from dvo.odometry.inertial.estimator import Similarity
@@ -136,6 +137,7 @@ def test_frames_without_a_view_are_predicted_and_never_counted_as_tracked() -> N
     result = odometry.finish()
     assert len(result.trajectory) == 16 and len(result.inertial) == 4
     assert result.frames_tracked == 12 and result.frames_lost == 0
+    assert result.quality is not None and result.quality.tracked == 12 / 16
     assert set(result.inertial) == {frame.timestamp for frame in images[12:]}
 
 
@@ -206,8 +208,12 @@ def test_metres_that_samples_do_not_confirm_leave_a_doubt(monkeypatch: pytest.Mo
         odometry.track(frame)
         if k == 9:
             align(odometry, frame.timestamp)
-    good = Quality("good", tracked=1.0)
-    monkeypatch.setattr("dvo.odometry.patch.tracker.judge_result", lambda *_: good)
+
+    def judged(graph: KeyframeGraph, *_: object) -> Quality:
+        assert graph.metric  # what is given is judged
+        return Quality("good", tracked=1.0)
+
+    monkeypatch.setattr("dvo.odometry.patch.tracker.judge_result", judged)
     monkeypatch.setattr(odometry.inertial.estimator, "settle", lambda *_: None)
     odometry.inertial.estimator.reason = reason
     result = odometry.finish()

@@ -91,7 +91,9 @@ def build_parser() -> argparse.ArgumentParser:
 
     evaluate = commands.add_parser("evaluate", help="compare trajectories with a reference, without a run")
     evaluate.add_argument(
-        "reference", metavar="REFERENCE", help="ground truth (TUM, KITTI, EuRoC or TartanAir), or a results folder"
+        "reference",
+        metavar="REFERENCE",
+        help="ground truth (TUM, KITTI, EuRoC or TartanAir), the folder of a data set, or a results folder",
     )
     evaluate.add_argument(
         "estimates", metavar="ESTIMATE", nargs="+", help="trajectories in these formats, or results folders"

@@ -89,6 +89,20 @@ def test_results_up_to_scale_have_no_metres(files, tmp_path, capsys):
     assert "up to scale" not in capsys.readouterr().out
 
 
+def test_the_folder_of_a_data_set_is_a_reference(files, tmp_path, capsys):
+    images = tmp_path / "data" / "images"
+    images.mkdir(parents=True)
+    for k in range(len(TIMES)):
+        cv2.imwrite(str(images / f"{k:04d}.png"), np.zeros((12, 16, 3), np.uint8))
+    assert main(["evaluate", "data", "half.txt"]) == 2
+    assert "data: a data set without ground truth" in capsys.readouterr().err
+    write_tum(tmp_path / "data" / "groundtruth_tum.txt", TRUTH)
+    assert main(["evaluate", "data", "half.txt"]) == 0
+    of_folder = capsys.readouterr().out.replace("data", "truth.txt")
+    assert main(["evaluate", "truth.txt", "half.txt"]) == 0
+    assert capsys.readouterr().out.split() == of_folder.split()
+
+
 def test_what_cannot_be_compared(files, capsys):
     assert main(["evaluate", "truth.txt", "late.txt", "--out", "none.png"]) == 1
     assert "late.txt: no error" in capsys.readouterr().err

@@ -16,6 +16,7 @@ from dvo.commands.places import check_outputs
 from dvo.commands.report import error_text
 from dvo.core.errors import DvoError
 from dvo.data.files.output import check_place, replaced
+from dvo.data.open import open_source
 from dvo.data.readers.groundtruth import read_groundtruth, rows_without_times
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Metrics, align_trajectory, associate, other_convention
@@ -90,10 +91,10 @@ def _frames(texts: Sequence[str]) -> np.ndarray | None:
         DvoError: a file that is not there, some with times and some without, or other numbers of rows.
     """
     for text in texts:
-        if not _file(text).is_file():
+        if not (_file(text).is_file() or _is_data_set(text)):
             remedy = "give trajectories (TUM), or results folders of dvo run"
             raise DvoError("no such file", file=_file(text), remedy=remedy)
-    rows = [rows_without_times(_file(text)) for text in texts]
+    rows = [None if _is_data_set(text) else rows_without_times(_file(text)) for text in texts]
     if all(count is None for count in rows):
         return None
     for text, count in zip(texts, rows, strict=True):
@@ -103,6 +104,11 @@ def _frames(texts: Sequence[str]) -> np.ndarray | None:
             remedy = "give trajectories with times, or one row for each image in all of them"
             raise DvoError(f"{this}, but {texts[0]} has {first}", file=_file(text), remedy=remedy)
     return np.arange(rows[0] or 0, dtype=np.float64)
+
+
+def _is_data_set(text: str) -> bool:
+    """True for a folder that is not one of results."""
+    return Path(text).is_dir() and not _file(text).is_file()
 
 
 def _are_numbers(file: Path, frames: int) -> bool:
@@ -128,6 +134,12 @@ def _is_up_to_scale(path: Path) -> bool:
 
 
 def _read(text: str, frames: np.ndarray | None) -> Trajectory:
+    if _is_data_set(text):
+        groundtruth = open_source(text, guess=True, imu="none").groundtruth
+        if groundtruth is None:
+            remedy = "give a trajectory (TUM), or a results folder of dvo run"
+            raise DvoError("a data set without ground truth", file=text, remedy=remedy)
+        return groundtruth
     return read_groundtruth(_file(text), frames)
 
 

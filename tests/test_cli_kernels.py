@@ -37,7 +37,7 @@ def is_plain(arguments):
     return isinstance(compiled_meanwhile(arguments), contextlib.nullcontext)
 
 
-ALL = {name: types for own in of_tracker.OF_PROCESSORS.values() for name, types in own.items()} | of_tracker.KERNELS
+ALL = of_tracker.KERNELS | of_tracker.BFLOAT16_KERNELS
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -58,13 +58,11 @@ def test_kernels_are_imported_without_torch():
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-@pytest.mark.parametrize(("features", "more"), [([], 0), (["avx512bf16"], 1), (["avx512bf16", "amx-bf16"], 2)])
-def test_those_of_some_processors_are_for_them_alone(features, more, monkeypatch):
-    """No others can compile them."""
-    monkeypatch.setattr("dvo.core.compiled.compiled_for", features.__contains__)
-    found = of_tracker.needed()
-    assert found.items() <= ALL.items() and found.items() >= of_tracker.KERNELS.items()
-    assert len(found) == len(of_tracker.KERNELS) + more
+@pytest.mark.parametrize("multiplies", [True, False])
+def test_those_for_bfloat16_are_for_such_machines_alone(multiplies, monkeypatch):
+    """No other can compile them."""
+    monkeypatch.setattr("dvo.core.compiled.compiles_bfloat16", lambda: multiplies)
+    assert of_tracker.needed() == (ALL if multiplies else of_tracker.KERNELS)
 
 
 def test_no_process_where_it_would_be_of_no_use(cold, monkeypatch):

@@ -88,14 +88,10 @@ def load_kept(kernel: Any, types: str) -> None:
 
 
 @cache
-def compiled_for(feature: str) -> bool:
-    """Tell if kernels are compiled for this CPU, and it has some instructions, which no others may use.
-
-    Args:
-        feature: LLVM's name of them, ``amx-bf16`` or ``avx512bf16``.
-    """
+def compiles_bfloat16() -> bool:
+    """Tell if kernels are compiled for this CPU, and it multiplies bfloat16 (AVX-512 BF16), which no others may."""
     another = any(getattr(config, name, None) for name in ("CPU_NAME", "CPU_FEATURES"))
-    return not another and bool(llvmlite.binding.get_host_cpu_features().get(feature))
+    return not another and bool(llvmlite.binding.get_host_cpu_features().get("avx512bf16"))
 
 
 def name_of(function: Callable[..., Any]) -> str:

@@ -101,19 +101,6 @@ def multiplies_bfloat16(device: torch.device) -> bool:
     return device.type == "cpu" and known is not None and bool(known())
 
 
-@cache
-def multiplies_tiles(device: torch.device) -> bool:
-    """Tell if a device is a CPU with matrix units for bfloat16 (Intel's AMX).
-
-    The operating system is asked for the permission to use them, which a process needs once.
-
-    Args:
-        device: any.
-    """
-    ask = getattr(torch.cpu, "_init_amx", None)  # torch 2.6 and newer
-    return device.type == "cpu" and ask is not None and bool(torch.cpu._is_amx_tile_supported() and ask())
-
-
 _forks = {"work": False, "after work": False}  # several threads have computed; this process was forked after that
 
 

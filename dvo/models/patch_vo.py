@@ -91,7 +91,7 @@ class PatchVO(nn.Module):
         """Copy for inference that multiplies in bfloat16, several times as fast on processors that have units for it.
 
         Inputs and outputs are float32, as are bundle adjustment and update operators of other kinds than the gated one.
-        A tracker's correlation is in bfloat16 too where the processor has such units.
+        A tracker's look-ups are in bfloat16 too where the processor multiplies it.
 
         Returns:
             The copy, in evaluation mode; parameters are rounded.

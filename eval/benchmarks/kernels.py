@@ -2,8 +2,7 @@
 
 Prints for each kernel a line: size, milliseconds of the kernel and of its PyTorch twin on one thread (medians of
 ``--repeats`` runs that take turns, so that a busy machine slows both), the ratio, and the largest difference of the
-results. The lines of ``bfloat16`` have the network in that precision, and in float32 in the place of the twin; without
-matrix units the tracker looks up in float32, and that line is left out.
+results. The lines of ``bfloat16`` have the network in that precision, and in float32 in the place of the twin.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from dvo.ba.solve import solve
 from dvo.ba.sparse.global_adjust import GlobalBAOptions
 from dvo.ba.sparse.levenberg import LMOptions
 from dvo.core.command_line import OneLineParser
-from dvo.core.context import multiplies_tiles
 from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.models.patch_vo import PatchVO
 from dvo.models.schedule import full_graph
@@ -161,7 +159,7 @@ def correlation(generator: torch.Generator) -> tuple[str, Call, Call]:
         edge_correlation(torch.Generator().manual_seed(seed), CPU, 1, dtype)
         for dtype in (torch.bfloat16, torch.float32)
     )
-    return size, lambda: half().float(), single
+    return size, half, single
 
 
 PRECISIONS = {
@@ -212,8 +210,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="kernels whose names contain this")
     parser.add_argument("--repeats", type=int, default=20, help="(%(default)s)")
     options = parser.parse_args()
-    left_out = set() if multiplies_tiles(CPU) else {"correlation, bfloat16"}
-    names = [name for name in (*KERNELS, *PRECISIONS) if name not in left_out]
+    names = (*KERNELS, *PRECISIONS)
     chosen = [name for name in names if options.only in name]
     if not chosen or options.repeats < 1:
         parser.error(f"no run: --only is part of {', '.join(names)}, --repeats at least 1")

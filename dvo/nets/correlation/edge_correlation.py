@@ -9,19 +9,17 @@ window, so that a row of a window is one contiguous range at every position.
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dvo.core.context import multiplies_tiles
+from dvo.core.context import multiplies_bfloat16
 from dvo.core.kernels import use_device_kernels, use_kernels
 
 # Map slots that memory is reserved for at first, on a CPU and on other devices. On a CPU a page takes memory once it is
 # written to: there they are as many as a window has, so that no frame waits for a copy of all maps.
 FIRST_MAPS, FIRST_ON_DEVICE = 40, 8
 _PIECE, _LARGE_PIECE = 32, 1024  # edges processed at once: in the cache of a processor; on other devices
-_TILED = 32, 16, 3  # channels are a multiple of; pixels of a patch, and radius, at most
 _SPREAD = 4  # pixels between those of a patch, up to which they share one window of the map
 
 
@@ -32,7 +30,8 @@ class EdgeCorrelation:
         scale: down-sampling of the level relative to the features.
         radius: correlation radius in pixels of the level.
         device: of the maps.
-        dtype: of maps and channels; bfloat16 is for matrix units of a CPU, and sums are those of float32.
+        dtype: of the maps; bfloat16 is for a CPU that multiplies it. Features are rounded as they are, and sums and
+            channels are float32.
 
     Attributes:
         maps: ``(N, H, W, C)`` features by map slot, each in a border of ``2 radius + 2`` zeros; others are not defined.
@@ -91,7 +90,7 @@ class EdgeCorrelation:
         """
         at = (coords.flatten(1, 2) / self.scale).contiguous()
         if self.maps.dtype == torch.bfloat16:
-            return self._lookup_tiled(at, features, kk, frames).flatten(1)
+            return self._lookup_bfloat16(at, features, kk, frames).flatten(1)
         if use_kernels(self.maps, features, at):
             from dvo.nets.correlation.edge_correlation_kernels import correlate
 
@@ -109,36 +108,20 @@ class EdgeCorrelation:
             out = correlate_edges(self.maps, features, at, kk, frames, self.radius)
         return out.flatten(1)
 
-    def _lookup_tiled(self, at: Tensor, features: Tensor, kk: Tensor, frames: Tensor) -> Tensor:
+    def _lookup_bfloat16(self, at: Tensor, features: Tensor, kk: Tensor, frames: Tensor) -> Tensor:
         """Look-up in maps of bfloat16."""
-        tiled = fits_tiles(features.shape[2], features.shape[1], self.radius)
-        if use_kernels(features, at) and tiled and multiplies_tiles(at.device):
-            from dvo.core.compiled import compiled_for
+        rounded = features.bfloat16()
+        if use_kernels(features, at) and multiplies_bfloat16(at.device):
+            from dvo.core.compiled import compiles_bfloat16
             from dvo.nets.correlation.edge_correlation_kernels import correlate_bfloat16
 
-            if compiled_for("amx-bf16"):
+            if compiles_bfloat16():
                 side = 2 * self.radius + 1
-                out = torch.empty(*at.shape[:2], side, side, dtype=torch.bfloat16)
-                pairs = features.bfloat16().contiguous().view(torch.uint16).numpy().view(np.uint32)
-                correlate_bfloat16(
-                    self.maps.view(torch.uint16).numpy(), pairs, at.numpy(), kk.numpy(), frames.numpy(), self.radius,
-                    out.view(torch.uint16).numpy(),
-                )  # fmt: skip
+                out = at.new_empty(*at.shape[:2], side, side)
+                maps, bits = (x.contiguous().view(torch.uint16).numpy() for x in (self.maps, rounded))
+                correlate_bfloat16(maps, bits, at.numpy(), kk.numpy(), frames.numpy(), self.radius, out.numpy())
                 return out
-        rounded = features.bfloat16().float()
-        return correlate_edges(self.maps, rounded, at, kk, frames, self.radius).bfloat16()
-
-
-def fits_tiles(channels: int, pixels: int, radius: int) -> bool:
-    """Tell if matrix units can look up the edges of a network.
-
-    Args:
-        channels: of the features.
-        pixels: of a patch.
-        radius: of the correlation.
-    """
-    multiple, most, largest = _TILED
-    return channels % multiple == 0 and pixels <= most and radius <= largest
+        return correlate_edges(self.maps, rounded.float(), at, kk, frames, self.radius)
 
 
 def correlate_edges(

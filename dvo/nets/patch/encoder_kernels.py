@@ -5,44 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
 from dvo.core.compiled import compiled, part
+from dvo.core.number_kernels import number, stored
 
 Array = Any
 
 _RUN = 64  # pixels whose sum is in single precision; sums of these are in double precision
-
-
-@intrinsic
-def _number(context, stored):
-    """Number that an array holds: of float32, or the bits of a bfloat16 as uint16."""
-
-    def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
-        if signature.args[0] == types.float32:
-            return given[0]
-        bits = builder.zext(given[0], ir.IntType(32))
-        return builder.bitcast(builder.shl(bits, ir.Constant(bits.type, 16)), ir.FloatType())
-
-    return types.float32(stored), generate
-
-
-@intrinsic
-def _stored(context, value, like):
-    """Number as an array with elements such as ``like`` holds it; bfloat16 is rounded to the nearest, ties to even."""
-
-    def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
-        if signature.args[1] == types.float32:
-            return given[0]
-        bits = builder.bitcast(given[0], ir.IntType(32))
-        one, half, size = (ir.Constant(bits.type, k) for k in (1, 0x7FFF, 16))
-        odd = builder.and_(builder.lshr(bits, size), one)
-        rounded = builder.add(builder.add(bits, half), odd)
-        return builder.trunc(builder.lshr(rounded, size), ir.IntType(16))
-
-    return like(types.float32, like), generate
 
 
 @part
@@ -63,11 +32,11 @@ def _normalise(x, eps, rectified, skip):
                 if squares:
                     for s in range(first, min(pixels, first + _RUN)):
                         for c in range(channels):
-                            part[c] += (_number(image[s, c]) - mean[c]) * (_number(image[s, c]) - mean[c])  # type: ignore[call-arg]
+                            part[c] += (number(image[s, c]) - mean[c]) * (number(image[s, c]) - mean[c])  # type: ignore[call-arg]
                 else:
                     for s in range(first, min(pixels, first + _RUN)):
                         for c in range(channels):
-                            part[c] += _number(image[s, c])  # type: ignore[call-arg]
+                            part[c] += number(image[s, c])  # type: ignore[call-arg]
                 for c in range(channels):
                     total[c] += part[c]
             for c in range(channels):
@@ -79,15 +48,15 @@ def _normalise(x, eps, rectified, skip):
             beside = skip[n]
             for s in range(pixels):
                 for c in range(channels):
-                    value = (_number(image[s, c]) - mean[c]) * factor[c]  # type: ignore[call-arg]
+                    value = (number(image[s, c]) - mean[c]) * factor[c]  # type: ignore[call-arg]
                     value = low if value < low else value  # NaN stays
-                    value = _number(beside[s, c]) + value
-                    image[s, c] = _stored(zero if value < zero else value, image[s, c])
+                    value = number(beside[s, c]) + value
+                    image[s, c] = stored(zero if value < zero else value, image[s, c])
         else:
             for s in range(pixels):
                 for c in range(channels):
-                    value = (_number(image[s, c]) - mean[c]) * factor[c]  # type: ignore[call-arg]
-                    image[s, c] = _stored(low if value < low else value, image[s, c])
+                    value = (number(image[s, c]) - mean[c]) * factor[c]  # type: ignore[call-arg]
+                    image[s, c] = stored(low if value < low else value, image[s, c])
 
 
 @compiled

@@ -84,23 +84,20 @@ KERNELS = {
     ),
 }
 """Kernels in the order in which a run needs them, each with the types of its arguments."""
-OF_PROCESSORS = {
-    "avx512bf16": {"dvo.nets.patch.encoder_kernels:normalise_bfloat16": "u2[:,:,::1], f8, b1, u2[:,:,::1]"},
-    "amx-bf16": {
-        "dvo.nets.correlation.edge_correlation_kernels:correlate_bfloat16": (
-            "u2[:,:,:,::1], u4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, u2[:,:,:,::1]"
-        )
-    },
+BFLOAT16_KERNELS = {
+    "dvo.nets.patch.encoder_kernels:normalise_bfloat16": "u2[:,:,::1], f8, b1, u2[:,:,::1]",
+    "dvo.nets.correlation.edge_correlation_kernels:correlate_bfloat16": (
+        "u2[:,:,:,::1], u2[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, f4[:,:,:,::1]"
+    ),
 }
-"""Those of processors with some instructions, see :func:`dvo.core.compiled.compiled_for`; they come first there."""
+"""Those of a CPU that multiplies bfloat16, which come first there."""
 
 
 def needed() -> dict[str, str]:
     """Kernels of this machine, see :data:`KERNELS`."""
-    from dvo.core.compiled import compiled_for
+    from dvo.core.compiled import compiles_bfloat16
 
-    own = [kernels for feature, kernels in OF_PROCESSORS.items() if compiled_for(feature)]
-    return {name: types for kernels in (*own, KERNELS) for name, types in kernels.items()}
+    return BFLOAT16_KERNELS | KERNELS if compiles_bfloat16() else KERNELS
 
 
 @cache

@@ -14,7 +14,7 @@ from dvo.ba.kernels import Kernel
 from dvo.ba.limits import DEPTH_RANGE, depth_range_of
 from dvo.ba.options import BADamping, BAOptions
 from dvo.ba.problem import Factor
-from dvo.core.context import multiplies_tiles
+from dvo.core.context import multiplies_bfloat16
 from dvo.map.edges import PatchGraph
 from dvo.map.measurements import depth_factors
 from dvo.map.window import Keyframe, Window, WindowSnapshot
@@ -22,7 +22,7 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.step import Revision, UpdateState, revise, step
 from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.nets.correlation.correlation import Correlation
-from dvo.nets.correlation.edge_correlation import EdgeCorrelation, fits_tiles
+from dvo.nets.correlation.edge_correlation import EdgeCorrelation
 from dvo.nets.patch.patchifier import patch_coordinates, pool_levels
 from dvo.odometry.frames.front_end import View, keyframe_of
 from dvo.odometry.window.alignment import AlignmentSnapshot, WindowAlignment
@@ -111,15 +111,14 @@ class WindowCorrelation:
 
     Args:
         window: provides the edges and patch features.
-        model: the network, whose precision is that of the maps where the device has units for it.
+        model: the network, whose precision is that of the maps where the device multiplies it.
         device: of the maps.
     """
 
     def __init__(self, window: Window, model: PatchVO, device: torch.device) -> None:
         config = model.config
         self.window, self.pyramid = window, config.pyramid
-        tiled = fits_tiles(config.feature_channels, config.patch_size**2, config.radius)
-        half = model.precision == torch.bfloat16 and tiled and multiplies_tiles(device)
+        half = model.precision == torch.bfloat16 and multiplies_bfloat16(device)
         dtype = torch.bfloat16 if half else torch.float32
         self.levels = [EdgeCorrelation(scale, config.radius, device, dtype) for scale in config.pyramid]
 

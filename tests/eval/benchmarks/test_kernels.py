@@ -1,9 +1,7 @@
 """Benchmark of kernels: a line for each, whose results agree; what is not there is refused."""
 
 import pytest
-import torch
 
-from dvo.core.context import multiplies_tiles
 from eval.benchmarks.kernels import main
 
 
@@ -18,8 +16,7 @@ def test_prints_both_precisions_of_the_network(monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["kernels", "--only", "bfloat16", "--repeats", "1"])
     main()
     lines = capsys.readouterr().out.splitlines()[1:]
-    tiled = ["correlation"] if multiplies_tiles(torch.device("cpu")) else []
-    assert [line.split(",")[0] for line in lines] == ["encoder", *tiled, "update"]
+    assert [line.split(",")[0] for line in lines] == ["encoder", "correlation", "update"]
     assert all(0 < float(line.split()[-1]) < 0.2 for line in lines)
 
 

@@ -1,0 +1,69 @@
+"""Look-up in maps of bfloat16: the twin everywhere, and the kernel where the CPU multiplies it."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dvo.core.compiled import compiles_bfloat16
+from dvo.core.context import multiplies_bfloat16
+from dvo.core.kernels import available
+from dvo.nets.correlation.edge_correlation import EdgeCorrelation
+
+CPU = torch.device("cpu")
+
+
+def filled(channels, radius, dtype, height=12, width=17, frames=3):
+    generator = torch.Generator().manual_seed(channels)
+    level = EdgeCorrelation(2.0, radius, CPU, dtype)
+    for slot in range(frames):
+        level.keep_map(slot, torch.randn(channels, height, width, generator=generator).bfloat16().float())
+    return level
+
+
+def edges(channels, side, spread, seed, count=40):
+    generator = torch.Generator().manual_seed(seed)
+    ticks = spread * (torch.arange(side) - side // 2)
+    patch = torch.stack(torch.meshgrid(ticks, ticks, indexing="xy"), -1)
+    coords = torch.rand(count, 1, 1, 2, generator=generator) * torch.tensor([60.0, 50.0]) - 12 + patch
+    coords[3, 0, 0, 1] = torch.nan
+    coords[5, ..., 0] = 1e6
+    features = torch.randn(7, side**2, channels, generator=generator).bfloat16().float()
+    kk, frames = (torch.randint(most, (count,), generator=generator) for most in (7, 3))
+    return coords, features, kk, frames
+
+
+@pytest.mark.parametrize("kernels", ["numba", "torch"])
+@given(
+    channels=st.sampled_from([32, 48, 64, 96]), radius=st.integers(1, 3), side=st.sampled_from([1, 3]),
+    spread=st.sampled_from([0.3, 1.0, 2.2, 9.0, 40.0]), seed=st.integers(0, 99),
+)  # fmt: skip
+def test_channels_are_those_of_single_precision(kernels, channels, radius, side, spread, seed):
+    """Of numbers that bfloat16 holds; some sizes are multiplied at once, and others one by one."""
+    given = edges(channels, side, spread, seed)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DVO_KERNELS", kernels)
+        found = filled(channels, radius, torch.bfloat16).lookup(*given)
+        expected = filled(channels, radius, torch.float32).lookup(*given)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-4, equal_nan=True)
+    assert found.isnan().any() and (found == 0).any()
+
+
+@pytest.mark.skipif(
+    not (available() and compiles_bfloat16() and multiplies_bfloat16(CPU)), reason="no bfloat16, or no kernels"
+)
+def test_the_kernel_is_used(monkeypatch):
+    from dvo.nets.correlation import edge_correlation_kernels
+
+    calls, kernel = [], edge_correlation_kernels.correlate_bfloat16
+    monkeypatch.setattr(edge_correlation_kernels, "correlate_bfloat16", lambda *given: calls.append(kernel(*given)))
+    filled(64, 3, torch.bfloat16).lookup(*edges(64, 3, 1.0, 0))
+    assert len(calls) == 1
+
+
+def test_no_kernel_for_another_cpu(monkeypatch):
+    monkeypatch.setattr("dvo.core.compiled.compiles_bfloat16", lambda: False)
+    monkeypatch.setattr("dvo.nets.correlation.edge_correlation_kernels.correlate_bfloat16", None)
+    given = edges(64, 3, 1.0, 0)
+    found, expected = (filled(64, 3, dtype).lookup(*given) for dtype in (torch.bfloat16, torch.float32))
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-4, equal_nan=True)

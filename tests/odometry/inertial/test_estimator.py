@@ -684,7 +684,7 @@ def test_a_scale_that_is_unsure_for_now_is_followed_and_not_called_aligned(monke
     recording = record(0, seconds=10.0)
     estimator = drive(recording, until=6.0)[0]
     assert estimator.scale_state is ScaleState.ALIGNED and not estimator.reason
-    for time, sigma, told in ((7.0, 0.08, True), (7.5, 0.15, False), (8.0, 0.08, False), (8.5, 0.04, True)):
+    for time, sigma, told in ((7.0, 0.05, True), (7.5, 0.15, False), (8.0, 0.05, False), (8.5, 0.03, True)):
         before = estimator.solution
         unsure_of_the_scale(monkeypatch, estimator, sigma)
         estimator.add(recording.samples.between(estimator.stream.end, time))

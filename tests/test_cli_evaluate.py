@@ -101,6 +101,8 @@ def test_the_folder_of_a_data_set_is_a_reference(files, tmp_path, capsys):
     of_folder = capsys.readouterr().out.replace("data", "truth.txt")
     assert main(["evaluate", "truth.txt", "half.txt"]) == 0
     assert capsys.readouterr().out.split() == of_folder.split()
+    assert main(["evaluate", "truth.txt", "data"]) == 2  # it has no estimate
+    assert "trajectory.txt: no such file" in capsys.readouterr().err
 
 
 def test_what_cannot_be_compared(files, capsys):

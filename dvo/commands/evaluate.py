@@ -91,7 +91,7 @@ def _frames(texts: Sequence[str]) -> np.ndarray | None:
         DvoError: a file that is not there, some with times and some without, or other numbers of rows.
     """
     for text in texts:
-        if not (_file(text).is_file() or _is_data_set(text)):
+        if not (_file(text).is_file() or text == texts[0] and _is_data_set(text)):
             remedy = "give trajectories (TUM), or results folders of dvo run"
             raise DvoError("no such file", file=_file(text), remedy=remedy)
     rows = [None if _is_data_set(text) else rows_without_times(_file(text)) for text in texts]
@@ -107,8 +107,9 @@ def _frames(texts: Sequence[str]) -> np.ndarray | None:
 
 
 def _is_data_set(text: str) -> bool:
-    """True for a folder that is not one of results."""
-    return Path(text).is_dir() and not _file(text).is_file()
+    """True for a folder that is not one of results: its ground truth is a reference, and no estimate."""
+    path = Path(text)
+    return path.is_dir() and not any((path / name).is_file() for name in (results.TRAJECTORY, results.SUMMARY))
 
 
 def _are_numbers(file: Path, frames: int) -> bool:

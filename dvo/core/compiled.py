@@ -89,7 +89,7 @@ def load_kept(kernel: Any, types: str) -> None:
 
 @cache
 def compiles_bfloat16() -> bool:
-    """Tell if kernels are compiled for this CPU, and it multiplies bfloat16 (AVX-512 BF16), which no others may."""
+    """Tell if kernels are compiled for this CPU, and it has instructions for products of bfloat16 (AVX-512 BF16)."""
     another = any(getattr(config, name, None) for name in ("CPU_NAME", "CPU_FEATURES"))
     return not another and bool(llvmlite.binding.get_host_cpu_features().get("avx512bf16"))
 

@@ -88,7 +88,7 @@ class PatchVO(nn.Module):
 
     @torch.inference_mode(False)
     def in_bfloat16(self) -> PatchVO:
-        """Copy for inference that multiplies in bfloat16, several times as fast on processors that have units for it.
+        """Copy for inference that multiplies in bfloat16, about twice as fast on processors with instructions for it.
 
         Inputs and outputs are float32, as are bundle adjustment and update operators of other kinds than the gated one.
         A tracker's look-ups are in bfloat16 too where the processor multiplies it.

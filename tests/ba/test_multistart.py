@@ -103,7 +103,7 @@ def test_a_problem_is_solved_from_nothing(seed):
     assert rotation_error(best.problem, moved) < 0.02
 
 
-@pytest.mark.parametrize("start", RESTARTS)
+@pytest.mark.parametrize("start", DEPTH_STARTS)
 def test_a_near_scene_keeps_its_depths(start):
     """The same problem in another unit, in which it is thirty times as near: the usual bound would hold all depths."""
     poses, problem = scene(0)

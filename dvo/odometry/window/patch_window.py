@@ -22,7 +22,7 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.step import Revision, UpdateState, revise, step
 from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.nets.correlation.correlation import Correlation
-from dvo.nets.correlation.edge_correlation import EdgeCorrelation
+from dvo.nets.correlation.edge_correlation import EdgeCorrelation, fits_bfloat16
 from dvo.nets.patch.patchifier import patch_coordinates, pool_levels
 from dvo.odometry.frames.front_end import View, keyframe_of
 from dvo.odometry.window.alignment import AlignmentSnapshot, WindowAlignment
@@ -118,7 +118,9 @@ class WindowCorrelation:
     def __init__(self, window: Window, model: PatchVO, device: torch.device) -> None:
         config = model.config
         self.window, self.pyramid = window, config.pyramid
-        half = model.precision == torch.bfloat16 and multiplies_bfloat16(device)
+        half = (
+            model.precision == torch.bfloat16 and multiplies_bfloat16(device) and fits_bfloat16(config.feature_channels)
+        )
         dtype = torch.bfloat16 if half else torch.float32
         self.levels = [EdgeCorrelation(scale, config.radius, device, dtype) for scale in config.pyramid]
 

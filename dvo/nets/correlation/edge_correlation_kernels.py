@@ -5,7 +5,8 @@ would sum each of them across the lanes of a vector on its own, which costs as m
 :func:`_eight_products` states in vector instructions how eight of them are summed at once, and :func:`_eight_adjoints`
 how a row of eight is taken back.
 
-Maps of bfloat16 are for CPUs that multiply it (AVX-512 BF16): an instruction adds 32 products to 16 sums of float32.
+Maps of bfloat16 are for CPUs that multiply it (AVX-512 BF16): an instruction adds 16 products to eight sums of float32
+(one of twice as many takes twice as long on Zen 4, and has more to sum in the end).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from dvo.core.number_kernels import number
 
 _WIDTH = 8
 _CHANNELS = 64  # of the features of the default network
-_PAIRS, _PAIRED = 16, 32  # sums and products of an instruction for bfloat16
+_PAIRED = 16  # products of an instruction for bfloat16
 _VECTOR = ir.VectorType(ir.FloatType(), _WIDTH)
 # Lanes of two vectors, side by side, whose sums are those of pairs of lanes, for each of three foldings.
 _FOLDINGS = (
@@ -32,7 +33,6 @@ _FOLDINGS = (
     ((0, 1, 8, 9, 4, 5, 12, 13), (2, 3, 10, 11, 6, 7, 14, 15)),
     ((0, 1, 2, 3, 8, 9, 10, 11), (4, 5, 6, 7, 12, 13, 14, 15)),
 )
-_HALVES = (0, 1, 2, 3, 4, 5, 6, 7), (8, 9, 10, 11, 12, 13, 14, 15)
 
 
 class _BFloat(ir.HalfType):  # llvmlite has none
@@ -48,12 +48,12 @@ def _eight_products(context, maps, first, feature, channels, out, position):
     """Store at ``position`` of ``out`` the dot products of a feature with eight pixels from ``first`` of flat maps.
 
     All arrays are contiguous and of float32; the channels are a multiple of eight. Or maps and feature are bits of
-    bfloat16, as uint16, and the channels a multiple of 32. If their number is a literal, the addresses of the pixels
+    bfloat16, as uint16, and the channels a multiple of 16. If their number is a literal, the addresses of the pixels
     are constants.
     """
     known = channels.literal_value if isinstance(channels, types.IntegerLiteral) else None
     single = maps.dtype == types.float32
-    stored, sums_type = (_VECTOR, _VECTOR) if single else (_BFLOATS, ir.VectorType(ir.FloatType(), _PAIRS))
+    stored = _VECTOR if single else _BFLOATS
 
     def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
         def array(k: int) -> Any:
@@ -65,8 +65,8 @@ def _eight_products(context, maps, first, feature, channels, out, position):
         def plus(before: Any, a: Any, b: Any) -> Any:
             if single:
                 return builder.fadd(before, builder.fmul(a, b, flags=("contract",)), flags=("contract",))
-            kind = ir.FunctionType(sums_type, [sums_type, stored, stored])
-            unit = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512bf16.dpbf16ps.512")
+            kind = ir.FunctionType(_VECTOR, [_VECTOR, stored, stored])
+            unit = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512bf16.dpbf16ps.256")
             return builder.call(unit, [before, a, b])
 
         def folded(first: Any, second: Any, folding: Any) -> Any:
@@ -80,7 +80,7 @@ def _eight_products(context, maps, first, feature, channels, out, position):
         builder.branch(loop)
 
         builder.position_at_end(loop)
-        channel, sums = builder.phi(channels.type), [builder.phi(sums_type) for _ in range(_WIDTH)]
+        channel, sums = builder.phi(channels.type), [builder.phi(_VECTOR) for _ in range(_WIDTH)]
         feature_part = loaded(builder.gep(array(2).data, [channel]))
         pixel, after = builder.gep(start, [channel]), []
         for before in sums:
@@ -88,14 +88,12 @@ def _eight_products(context, maps, first, feature, channels, out, position):
             pixel = builder.gep(pixel, [channels])
         following = builder.add(channel, ir.Constant(channels.type, stored.count))
         builder.cbranch(builder.icmp_signed("<", following, channels), loop, end)
-        zeros = [0.0] * sums_type.count
+        zeros = [0.0] * _WIDTH
         for value, zero, further in zip([channel, *sums], [0] + [zeros] * _WIDTH, [following, *after], strict=True):
             value.add_incoming(ir.Constant(value.type, zero), entry)
             value.add_incoming(further, loop)
 
         builder.position_at_end(end)
-        if not single:
-            after = [folded(each, each, _HALVES) for each in after]
         for folding in _FOLDINGS:
             after = [folded(a, b, folding) for a, b in zip(after[::2], after[1::2], strict=True)]
         place = builder.gep(array(4).data, [given[5]])
@@ -103,6 +101,61 @@ def _eight_products(context, maps, first, feature, channels, out, position):
         return target.get_dummy_value()
 
     return types.void(maps, types.intp, feature, types.intp if known is None else channels, out, types.intp), generate
+
+
+@intrinsic
+def _fetch(context, flat, position):
+    """Ask for the cache line with an element of a flat array, which is read soon."""
+
+    def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
+        array = cgutils.create_struct_proxy(signature.args[0])(target, builder, value=given[0])
+        byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
+        fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        place = builder.bitcast(builder.gep(array.data, [given[1]]), byte)
+        builder.call(fetch, [place, *(ir.Constant(flag, value) for value in (0, 3, 1))])  # to read, near, data
+        return target.get_dummy_value()
+
+    return types.void(flat, types.intp), generate
+
+
+@intrinsic
+def _blend_eight(context, products, fx, fy, out, position):
+    """Store at ``position`` of flat ``out`` the 7 x 7 bilinear blends of 8 x 8 flat products; all are of float32."""
+
+    def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
+        def vector(k: int, place: Any) -> Any:
+            array = cgutils.create_struct_proxy(signature.args[k])(target, builder, value=given[k])
+            return builder.bitcast(builder.gep(array.data, [place]), _VECTOR.as_pointer())
+
+        def shuffled(a: Any, b: Any, lanes: Any) -> Any:
+            return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), lanes))
+
+        def everywhere(value: Any) -> Any:
+            first = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+            return shuffled(first, first, [0] * _WIDTH)
+
+        def between(a: Any, b: Any, share: Any) -> Any:
+            step = builder.fmul(share, builder.fsub(b, a), flags=("contract",))
+            return builder.fadd(a, step, flags=("contract",))
+
+        def place(at: int) -> Any:
+            return ir.Constant(given[4].type, at)
+
+        fx, fy = everywhere(given[1]), everywhere(given[2])
+        rows = [builder.load(vector(0, place(_WIDTH * i)), align=4) for i in range(_WIDTH)]
+        before = None
+        for i in range(_WIDTH - 1):
+            across = between(rows[i], rows[i + 1], fy)
+            row = between(across, shuffled(across, across, [1, 2, 3, 4, 5, 6, 7, 7]), fx)
+            at = builder.add(given[4], place((_WIDTH - 1) * i))
+            if i == _WIDTH - 2:  # the last lane of a row is overwritten by the next, and this has none
+                row, at = shuffled(before, row, [6, 8, 9, 10, 11, 12, 13, 14]), builder.sub(at, place(1))
+            builder.store(row, vector(3, at), align=4)
+            before = row
+        return target.get_dummy_value()
+
+    return types.void(products, types.float32, types.float32, out, types.intp), generate
 
 
 @intrinsic
@@ -256,10 +309,21 @@ def _correlate(maps, features, at, kk, frames, radius, step, out):
     """Body of both kernels."""
     taps = 2 * radius + 2
     _, height, width, channels = maps.shape
-    flat = maps.reshape(-1)
+    flat, flat_out = maps.reshape(-1), out.reshape(-1)
     products = np.empty((taps, taps), np.float32)
-    for edge in _by_frame(frames, len(maps)):
+    flat_products = products.reshape(-1)
+    order, line = _by_frame(frames, len(maps)), 2 * step
+    for place, edge in enumerate(order):
+        # Windows of the next edge are asked for row by row meanwhile.
+        following = order[min(place + 1, len(order) - 1)]
+        x, y, ahead = at[following, 0, 0], at[following, 0, 1], -1
+        if not (math.isnan(x) or math.isnan(y)):
+            left, top, _, _ = _corner(x, y, radius, height, width)
+            ahead = ((frames[following] * height + top) * width + left) * channels
         for pixel in range(at.shape[1]):
+            if ahead >= 0:
+                for near in range(0, (taps + 2) * channels, line):
+                    _fetch(flat, min(ahead + pixel * width * channels + near, flat.size - 1))  # type: ignore[call-arg]
             x, y = at[edge, pixel, 0], at[edge, pixel, 1]
             if math.isnan(x) or math.isnan(y):
                 for i in range(taps - 1):
@@ -269,7 +333,11 @@ def _correlate(maps, features, at, kk, frames, radius, step, out):
             left, top, fx, fy = _corner(x, y, radius, height, width)
             first = ((frames[edge] * height + top) * width + left) * channels
             _products(flat, first, width * channels, features[kk[edge], pixel], step, products)
-            _blend(products, fx, fy, out[edge, pixel])
+            if taps == _WIDTH:
+                begin = (edge * at.shape[1] + pixel) * (taps - 1) * (taps - 1)
+                _blend_eight(flat_products, fx, fy, flat_out, begin)  # type: ignore[call-arg]
+            else:
+                _blend(products, fx, fy, out[edge, pixel])
 
 
 @compiled

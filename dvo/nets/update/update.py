@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dvo.core.kernels import is_transformed
+from dvo.core.kernels import is_transformed, use_kernels
 from dvo.core.registry import Registry
 from dvo.map.edges import Groups, PatchGraph
 from dvo.nets.correlation.correlation import Correlation
@@ -312,6 +312,15 @@ class Update(nn.Module):
             New state ``(B, E, D)``, flow revision ``(B, E, 2)`` in feature pixels, confidence ``(B, E, 2)`` in (0, 1).
         """
         dtype = self.norm.weight.dtype
+        if len(hidden) == 1 and hidden.shape[1] and self._takes_kernels(hidden, context):
+            from dvo.nets.update.fast_update import revise_by_kernels
+
+            first = self.corr[0]
+            assert isinstance(first, nn.Linear)
+            seen = first_layer(first, correlation, self.taps)
+            given = hidden[0].contiguous(), context[0].contiguous(), seen[0], graph
+            state, delta, confidence = (x[None].to(hidden.dtype) for x in revise_by_kernels(self, *given))
+            return state, delta, confidence
         state, has_previous, has_following = (
             x.to(dtype) for x in (hidden + context, graph.has_previous, graph.has_following)
         )
@@ -327,3 +336,8 @@ class Update(nn.Module):
             return revised
         state, delta, confidence = (x.to(hidden.dtype) for x in revised)
         return state, delta, confidence
+
+    def _takes_kernels(self, *given: Tensor) -> bool:
+        """True where nothing is differentiated, on a CPU (:mod:`dvo.nets.update.fast_update`)."""
+        plain = not torch.is_grad_enabled() and not torch.is_autocast_enabled("cpu")
+        return plain and self.norm.weight.dtype in (torch.float32, torch.bfloat16) and use_kernels(*given)

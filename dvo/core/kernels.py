@@ -26,6 +26,7 @@ from dvo.core.text import print_line
 VARIABLE = "DVO_KERNELS"
 CHOICES = ("numba", "torch")
 _IMPORTING = threading.Lock()
+_FOUND: list[str] = []  # packages that were imported
 
 
 def use_kernels(*tensors: Tensor, double: bool = False, half: bool = False, adjoint: bool = False) -> bool:
@@ -116,6 +117,8 @@ def _chosen() -> str:
 
 
 def _imported() -> bool:
+    if _FOUND:
+        return True
     with _IMPORTING:  # a line of two threads would be two
         return _import()
 
@@ -128,4 +131,5 @@ def _import() -> bool:
         reason = " ".join(str(error).split())[:200]
         print_line(f"dvo: note: numba cannot be imported ({reason}): computing without kernels, slower", error=True)
         return False
+    _FOUND.append("numba")
     return True

@@ -127,6 +127,13 @@ def patch_warps(
         Derivative of the position in the target frame by the position in the patch; the identity where a patch is
         seen so obliquely, or grows or shrinks so much, that its window would not show the same.
     """
+    if use_kernels(*((coords,) if tilts is None else (coords, tilts))):
+        from dvo.nets.alignment.alignment_kernels import warps_of
+
+        found = coords.new_empty(len(coords), 2, 2)
+        known = found[:0] if tilts is None else tilts.contiguous()
+        warps_of(coords.contiguous().numpy(), known.numpy(), *_SCALES, found.numpy())
+        return found
     p = coords.shape[1]
     c, last = p // 2, p - 1
     columns = (coords[:, c, last] - coords[:, c, 0], coords[:, last, c] - coords[:, 0, c])
@@ -177,6 +184,13 @@ def texture(
     Returns:
         Root of the smaller eigenvalue of the mean structure tensor, grey levels a pixel.
     """
+    if use_kernels(images, centres) and min(images.shape[1:]) > 1:
+        from dvo.nets.alignment import alignment_kernels
+
+        found = centres.new_empty(len(centres))
+        arrays = images.contiguous().numpy(), frames.numpy(), centres.contiguous().numpy()
+        alignment_kernels.texture(*arrays, side, found.numpy())
+        return found
     _, _, gx, gy = grey_windows(images, frames, centres, side)
     a, b, c = gx.square().mean(1), (gx * gy).mean(1), gy.square().mean(1)
     return ((a + c) / 2 - (((a - c) / 2).square() + b.square()).sqrt()).clamp(min=0).sqrt()
@@ -270,6 +284,15 @@ def accept(
         ``(E,)`` bool, True for the alignment.
     """
     half = options.window // 2
+    given = found.positions, found.correlation, found.last_step, measured
+    if use_kernels(*given):
+        from dvo.nets.alignment.alignment_kernels import accepted
+
+        decided = torch.empty(len(measured), dtype=torch.bool)
+        arrays = (x.contiguous().numpy() for x in given)
+        limits = options.reach * pixels, options.last_step, options.correlation
+        accepted(*arrays, *size, half, *limits, decided.numpy())
+        return decided
     x, y = found.positions.unbind(-1)
     inside = (x >= half) & (x <= size[0] - 1 - half) & (y >= half) & (y <= size[1] - 1 - half)
     near = (found.positions - measured).norm(dim=-1) <= options.reach * pixels

@@ -1,4 +1,4 @@
-"""Kernel of :func:`dvo.nets.alignment.alignment.align_patches`."""
+"""Kernels of :mod:`dvo.nets.alignment.alignment`."""
 
 from __future__ import annotations
 
@@ -103,3 +103,61 @@ def align(images, source, target, centres, start, warps, side, iterations, floor
         _look(image, height, width, x, y, warp, side, seen)
         positions[edge, 0], positions[edge, 1], quality[1, edge] = x, y, moved
         quality[0, edge] = _dot(seen, grey) / np.sqrt(energy * (_dot(seen, seen) + floor))
+
+
+@compiled
+def texture(images, frames, centres, side, out):
+    """Fill ``out (E,)``; the rest is as in the twin, of images with two rows and columns at least."""
+    count, height, width = images.shape
+    flat, half = images.reshape(count, height * width), side // 2 + 1
+    around = np.empty((side + 2, side + 2), np.float32)
+    for e in range(len(frames)):
+        for i in range(side + 2):
+            for j in range(side + 2):
+                x, y = centres[e, 0] + np.float32(j - half), centres[e, 1] + np.float32(i - half)
+                around[i, j] = _sample(flat[frames[e]], height, width, x, y)
+        xx = xy = yy = np.float32(0)
+        for i in range(1, side + 1):
+            for j in range(1, side + 1):
+                across, down = around[i, j + 1] - around[i, j - 1], around[i + 1, j] - around[i - 1, j]
+                xx += across * across
+                xy += across * down
+                yy += down * down
+        middle, difference = (xx + yy) / 2, (xx - yy) / 2
+        least = middle - np.sqrt(difference * difference + xy * xy)
+        out[e] = np.sqrt(max(least, 0) / (4 * side * side))
+
+
+@compiled
+def warps_of(coords, tilts, smallest, largest, out):
+    """Fill ``out (E, 2, 2)``; the rest is as in the twin, :func:`dvo.nets.alignment.alignment.patch_warps`.
+
+    ``tilts (E, 2, 2)``, or none of them: zero.
+    """
+    last = coords.shape[1] - 1
+    middle = coords.shape[1] // 2
+    for e in range(len(coords)):
+        for axis in range(2):
+            out[e, axis, 0] = (coords[e, middle, last, axis] - coords[e, middle, 0, axis]) / np.float32(last)
+            out[e, axis, 1] = (coords[e, last, middle, axis] - coords[e, 0, middle, axis]) / np.float32(last)
+            if len(tilts):
+                out[e, axis, 0] += tilts[e, axis, 0]
+                out[e, axis, 1] += tilts[e, axis, 1]
+        area = out[e, 0, 0] * out[e, 1, 1] - out[e, 0, 1] * out[e, 1, 0]
+        if not smallest < area < largest:  # nor NaN
+            out[e, 0, 0] = out[e, 1, 1] = 1
+            out[e, 0, 1] = out[e, 1, 0] = 0
+
+
+@compiled
+def accepted(positions, correlation, last_step, measured, width, height, half, reach, longest, least, out):
+    """Fill ``out (E,)`` bool with the decision of :func:`dvo.nets.alignment.alignment.accept`.
+
+    ``reach`` and ``longest``, of the last step, are in pixels, ``least`` is of the correlation.
+    """
+    for e in range(len(positions)):
+        x, y = positions[e, 0], positions[e, 1]
+        dx, dy = np.float64(x - measured[e, 0]), np.float64(y - measured[e, 1])
+        good = half <= x <= width - 1 - half and half <= y <= height - 1 - half
+        good = good and np.sqrt(dx * dx + dy * dy) <= reach
+        out[e] = good and last_step[e] <= longest and correlation[e] >= least

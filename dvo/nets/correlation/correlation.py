@@ -262,17 +262,18 @@ def _by_kernel(level: _Level, radius: int, place: _Place) -> Tensor:
     import dvo.nets.correlation.edge_correlation_kernels as kernels
 
     position, side = place.position, 2 * radius + 1
-    out = position.new_empty(len(position), side, side, position.shape[1])
-    to = out.permute(0, 3, 2, 1).numpy()
     given: tuple[Any, ...]
     if level.volume is not None:
+        out = position.new_empty(len(position), side, side, position.shape[1])
+        to = out.permute(0, 3, 2, 1).numpy()
         given = level.volume.view(-1).numpy(), place.start.numpy(), position.numpy(), *level.size, radius, to
         kernels.look_up(*given)
-    else:
-        arrays: tuple[Any, ...] = (level.maps, level.features, position, place.patch, place.frame)
-        given = *(x.numpy() for x in arrays), radius, to
-        kernels.correlate(*given)
-    return out
+        return out
+    found = position.new_empty(*position.shape[:2], side, side)
+    arrays: tuple[Any, ...] = (level.maps, level.features, position, place.patch, place.frame)
+    given = *(x.numpy() for x in arrays), radius, found.numpy()
+    kernels.correlate(*given)
+    return found.permute(0, 3, 2, 1).contiguous()
 
 
 def _by_adjoint(level: _Level, radius: int, place: _Place, grad: Tensor) -> None:

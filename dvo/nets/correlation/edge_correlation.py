@@ -30,8 +30,8 @@ class EdgeCorrelation:
         scale: down-sampling of the level relative to the features.
         radius: correlation radius in pixels of the level.
         device: of the maps.
-        dtype: of the maps; bfloat16 is for a CPU that multiplies it. Features are rounded as they are, and sums and
-            channels are float32.
+        dtype: of the maps, and of the channels; bfloat16 is for a CPU that multiplies it. Features are rounded as the
+            maps are, and sums are float32.
 
     Attributes:
         maps: ``(N, H, W, C)`` features by map slot, each in a border of ``2 radius + 2`` zeros; others are not defined.
@@ -117,11 +117,11 @@ class EdgeCorrelation:
 
             if compiles_bfloat16():
                 side = 2 * self.radius + 1
-                out = at.new_empty(*at.shape[:2], side, side)
-                maps, bits = (x.contiguous().view(torch.uint16).numpy() for x in (self.maps, rounded))
-                correlate_bfloat16(maps, bits, at.numpy(), kk.numpy(), frames.numpy(), self.radius, out.numpy())
+                out = rounded.new_empty(*at.shape[:2], side, side)
+                maps, bits, found = (x.contiguous().view(torch.uint16).numpy() for x in (self.maps, rounded, out))
+                correlate_bfloat16(maps, bits, at.numpy(), kk.numpy(), frames.numpy(), self.radius, found)
                 return out
-        return correlate_edges(self.maps, rounded.float(), at, kk, frames, self.radius)
+        return correlate_edges(self.maps, rounded.float(), at, kk, frames, self.radius).bfloat16()
 
 
 def fits_bfloat16(channels: int) -> bool:

@@ -21,7 +21,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from dvo.core.compiled import compiled, part
-from dvo.core.number_kernels import number
+from dvo.core.number_kernels import number, stored
 
 _WIDTH = 8
 _CHANNELS = 64  # of the features of the default network
@@ -40,7 +40,7 @@ class _BFloat(ir.HalfType):  # llvmlite has none
         return "bfloat"
 
 
-_BFLOATS = ir.VectorType(object.__new__(_BFloat), _PAIRED)
+_BFLOATS, _BFLOATS_KEPT = (ir.VectorType(object.__new__(_BFloat), size) for size in (_PAIRED, _WIDTH))
 
 
 @intrinsic(prefer_literal=True)
@@ -53,19 +53,19 @@ def _eight_products(context, maps, first, feature, channels, out, position):
     """
     known = channels.literal_value if isinstance(channels, types.IntegerLiteral) else None
     single = maps.dtype == types.float32
-    stored = _VECTOR if single else _BFLOATS
+    read = _VECTOR if single else _BFLOATS
 
     def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
         def array(k: int) -> Any:
             return cgutils.create_struct_proxy(signature.args[k])(target, builder, value=given[k])
 
         def loaded(pointer: Any) -> Any:
-            return builder.load(builder.bitcast(pointer, stored.as_pointer()), align=4 if single else 2)
+            return builder.load(builder.bitcast(pointer, read.as_pointer()), align=4 if single else 2)
 
         def plus(before: Any, a: Any, b: Any) -> Any:
             if single:
                 return builder.fadd(before, builder.fmul(a, b, flags=("contract",)), flags=("contract",))
-            kind = ir.FunctionType(_VECTOR, [_VECTOR, stored, stored])
+            kind = ir.FunctionType(_VECTOR, [_VECTOR, read, read])
             unit = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512bf16.dpbf16ps.256")
             return builder.call(unit, [before, a, b])
 
@@ -75,25 +75,33 @@ def _eight_products(context, maps, first, feature, channels, out, position):
             return builder.fadd(one, other)
 
         channels = given[3] if known is None else ir.Constant(given[1].type, known)
-        start = builder.gep(array(0).data, [given[1]])
-        entry, loop, end = builder.block, builder.append_basic_block(), builder.append_basic_block()
-        builder.branch(loop)
+        start, zero = builder.gep(array(0).data, [given[1]]), ir.Constant(given[1].type, 0)
+        nothing = [ir.Constant(_VECTOR, [0.0] * _WIDTH)] * _WIDTH
 
-        builder.position_at_end(loop)
-        channel, sums = builder.phi(channels.type), [builder.phi(_VECTOR) for _ in range(_WIDTH)]
-        feature_part = loaded(builder.gep(array(2).data, [channel]))
-        pixel, after = builder.gep(start, [channel]), []
-        for before in sums:
-            after.append(plus(before, feature_part, loaded(pixel)))
-            pixel = builder.gep(pixel, [channels])
-        following = builder.add(channel, ir.Constant(channels.type, stored.count))
-        builder.cbranch(builder.icmp_signed("<", following, channels), loop, end)
-        zeros = [0.0] * _WIDTH
-        for value, zero, further in zip([channel, *sums], [0] + [zeros] * _WIDTH, [following, *after], strict=True):
-            value.add_incoming(ir.Constant(value.type, zero), entry)
-            value.add_incoming(further, loop)
+        def added(sums: Any, channel: Any) -> Any:
+            feature_part = loaded(builder.gep(array(2).data, [channel]))
+            pixel, after = builder.gep(start, [channel]), []
+            for before in sums:
+                after.append(plus(before, feature_part, loaded(pixel)))
+                pixel = builder.gep(pixel, [channels])
+            return after
 
-        builder.position_at_end(end)
+        if known is not None:
+            after = nothing
+            for channel in range(0, known, read.count):
+                after = added(after, ir.Constant(zero.type, channel))
+        else:
+            entry, loop, end = builder.block, builder.append_basic_block(), builder.append_basic_block()
+            builder.branch(loop)
+            builder.position_at_end(loop)
+            channel, sums = builder.phi(zero.type), [builder.phi(_VECTOR) for _ in range(_WIDTH)]
+            after = added(sums, channel)
+            following = builder.add(channel, ir.Constant(zero.type, read.count))
+            builder.cbranch(builder.icmp_signed("<", following, channels), loop, end)
+            for value, first, further in zip([channel, *sums], [zero, *nothing], [following, *after], strict=True):
+                value.add_incoming(first, entry)
+                value.add_incoming(further, loop)
+            builder.position_at_end(end)
         for folding in _FOLDINGS:
             after = [folded(a, b, folding) for a, b in zip(after[::2], after[1::2], strict=True)]
         place = builder.gep(array(4).data, [given[5]])
@@ -121,12 +129,22 @@ def _fetch(context, flat, position):
 
 @intrinsic
 def _blend_eight(context, products, fx, fy, out, position):
-    """Store at ``position`` of flat ``out`` the 7 x 7 bilinear blends of 8 x 8 flat products; all are of float32."""
+    """Store at ``position`` of flat ``out`` the 7 x 7 bilinear blends of 8 x 8 flat products of float32.
+
+    ``out`` is of float32, or holds bits of bfloat16.
+    """
+    single = out.dtype == types.float32
+    kept = _VECTOR if single else _BFLOATS_KEPT
 
     def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
-        def vector(k: int, place: Any) -> Any:
+        def vector(k: int, place: Any, kind: Any) -> Any:
             array = cgutils.create_struct_proxy(signature.args[k])(target, builder, value=given[k])
-            return builder.bitcast(builder.gep(array.data, [place]), _VECTOR.as_pointer())
+            return builder.bitcast(builder.gep(array.data, [place]), kind.as_pointer())
+
+        def rounded(row: Any) -> Any:
+            kind = ir.FunctionType(kept, [_VECTOR])
+            unit = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512bf16.cvtneps2bf16.256")
+            return builder.call(unit, [row])
 
         def shuffled(a: Any, b: Any, lanes: Any) -> Any:
             return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), lanes))
@@ -143,7 +161,7 @@ def _blend_eight(context, products, fx, fy, out, position):
             return ir.Constant(given[4].type, at)
 
         fx, fy = everywhere(given[1]), everywhere(given[2])
-        rows = [builder.load(vector(0, place(_WIDTH * i)), align=4) for i in range(_WIDTH)]
+        rows = [builder.load(vector(0, place(_WIDTH * i), _VECTOR), align=4) for i in range(_WIDTH)]
         before = None
         for i in range(_WIDTH - 1):
             across = between(rows[i], rows[i + 1], fy)
@@ -151,7 +169,7 @@ def _blend_eight(context, products, fx, fy, out, position):
             at = builder.add(given[4], place((_WIDTH - 1) * i))
             if i == _WIDTH - 2:  # the last lane of a row is overwritten by the next, and this has none
                 row, at = shuffled(before, row, [6, 8, 9, 10, 11, 12, 13, 14]), builder.sub(at, place(1))
-            builder.store(row, vector(3, at), align=4)
+            builder.store(row if single else rounded(row), vector(3, at, kept), align=4 if single else 2)
             before = row
         return target.get_dummy_value()
 
@@ -270,7 +288,7 @@ def _blend(products, fx, fy, out):
         for j in range(len(out)):
             u = products[i, j] + fy * (products[i + 1, j] - products[i, j])
             v = products[i, j + 1] + fy * (products[i + 1, j + 1] - products[i, j + 1])
-            out[i, j] = u + fx * (v - u)
+            out[i, j] = stored(u + fx * (v - u), out[i, j])  # type: ignore[call-arg]
 
 
 @part
@@ -328,7 +346,7 @@ def _correlate(maps, features, at, kk, frames, radius, step, out):
             if math.isnan(x) or math.isnan(y):
                 for i in range(taps - 1):
                     for j in range(taps - 1):
-                        out[edge, pixel, i, j] = math.nan
+                        out[edge, pixel, i, j] = stored(np.float32(np.nan), out[edge, pixel, i, j])  # type: ignore[call-arg]
                 continue
             left, top, fx, fy = _corner(x, y, radius, height, width)
             first = ((frames[edge] * height + top) * width + left) * channels
@@ -342,13 +360,13 @@ def _correlate(maps, features, at, kk, frames, radius, step, out):
 
 @compiled
 def correlate(maps, features, at, kk, frames, radius, out):
-    """Fill ``out (E, q, 2r+1, 2r+1)``; the other arguments are those of the twin, maps and features contiguous."""
+    """Fill ``out (E, q, 2r+1, 2r+1)``; the other arguments are those of the twin; all but positions are contiguous."""
     _correlate(maps, features, at, kk, frames, radius, _WIDTH, out)
 
 
 @compiled
 def correlate_bfloat16(maps, features, at, kk, frames, radius, out):
-    """:func:`correlate` of maps and features that are bits of bfloat16, as uint16, for CPUs that multiply it."""
+    """:func:`correlate` where maps, features and ``out`` are bits of bfloat16, as uint16, for CPUs that multiply it."""
     _correlate(maps, features, at, kk, frames, radius, _PAIRED, out)
 
 

@@ -10,10 +10,11 @@ import math
 from typing import Protocol
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from dvo.core.kernels import use_kernels
 from dvo.core.registry import Registry
 
 SELECTIONS = Registry(
@@ -103,8 +104,21 @@ def structure_selection(
     """
     b, n, height, width = _feature_size(images)
     points = _positions(b, n, patches, CANDIDATES, height, width, generator).to(images.device)
-    index = (points[..., 1] * width + points[..., 0]).flatten(2)
-    return _best(points, structure_score(images).flatten(2).gather(2, index))
+    return _best(points, score_at(images, points.flatten(2, 3)))
+
+
+def score_at(images: Float[Tensor, "B N 3 H W"], points: Int[Tensor, "B N P 2"]) -> Float[Tensor, "B N P"]:
+    """:func:`structure_score` at some feature positions ``x, y``."""
+    if images.dtype == torch.uint8 and images.device.type == "cpu" and use_kernels():
+        from dvo.nets.patch.selection_kernels import structure_scores
+
+        scores = torch.empty(points.shape[:-1])
+        for image, places, out in zip(*(x.flatten(0, 1).numpy() for x in (images, points, scores)), strict=True):
+            structure_scores(image, places, _STRIDE, _BOX, out)
+        return scores
+    scores = structure_score(images)
+    index = points[..., 1] * scores.shape[-1] + points[..., 0]
+    return scores.flatten(2).gather(2, index)
 
 
 def structure_score(images: Float[Tensor, "B N 3 H W"]) -> Float[Tensor, "B N h w"]:

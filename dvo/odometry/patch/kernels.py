@@ -18,13 +18,25 @@ KERNELS = {
         "f4[:,:,::1], f4[:,:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8[::1], f8, f8, f4[:,:,:,::1], "
         "f4[:,:,::1], b1[:,:,::1]"
     ),
+    "dvo.nets.patch.selection_kernels:structure_scores": "u1[:,:,:], i8[:,::1], i8, i8, f4[::1]",
     "dvo.nets.patch.encoder_kernels:normalise": "f4[:,:,::1], f8, b1, f4[:,:,::1]",
     "dvo.nets.correlation.edge_correlation_kernels:correlate": (
         "f4[:,:,:,::1], f4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, f4[:,:,:,::1]"
     ),
+    "dvo.nets.update.update_kernels:normalise": "f4[:,::1], f4[::1], f4[::1], f8, b1",
+    "dvo.nets.update.update_kernels:join": "f4[:,::1], f4[:,::1], f4[:,::1], f4[::1], f4[::1], f8, f4[:,::1]",
+    "dvo.nets.update.update_kernels:neighbours": "f4[:,::1], f4[:,::1], i8[::1], b1[::1], f4[:,::1]",
+    "dvo.nets.update.update_kernels:pool": "f4[:,::1], f4[:,::1], i8[:,::1], b1[:,::1], f4[:,::1]",
+    "dvo.nets.update.update_kernels:spread": "f4[:,::1], f4[:,::1], i8[::1]",
+    "dvo.nets.update.update_kernels:gate": "f4[:,::1], f4[:,::1], f4[:,::1], f4[::1], f4[::1], f8",
     "dvo.nets.alignment.alignment_kernels:align": (
         "f4[:,:,::1], i8[::1], i8[::1], f4[:,::1], f4[:,::1], f4[:,:,::1], i8, i8, f8, f8, f4[:,::1], f4[:,::1]"
     ),
+    "dvo.nets.alignment.alignment_kernels:warps_of": "f4[:,:,:,::1], f4[:,:,::1], f8, f8, f4[:,:,::1]",
+    "dvo.nets.alignment.alignment_kernels:accepted": (
+        "f4[:,::1], f4[::1], f4[::1], f4[:,::1], i8, i8, i8, f8, f8, f8, b1[::1]"
+    ),
+    "dvo.nets.alignment.alignment_kernels:texture": "f4[:,:,::1], i8[::1], f4[:,::1], i8, f4[::1]",
     "dvo.ba.layer.edgewise_kernels:frame_pairs": "i8[::1], i8[::1], i8[::1], i8, i8",
     "dvo.ba.layer.edgewise_kernels:take_steps": (
         "f4[:,:,::1], f4[:,::1], f4[:,:,::1], f4[:,:,::1], f4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], "
@@ -87,17 +99,25 @@ KERNELS = {
 BFLOAT16_KERNELS = {
     "dvo.nets.patch.encoder_kernels:normalise_bfloat16": "u2[:,:,::1], f8, b1, u2[:,:,::1]",
     "dvo.nets.correlation.edge_correlation_kernels:correlate_bfloat16": (
-        "u2[:,:,:,::1], u2[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, f4[:,:,:,::1]"
+        "u2[:,:,:,::1], u2[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, u2[:,:,:,::1]"
     ),
+    "dvo.nets.update.update_kernels:normalise": "u2[:,::1], u2[::1], u2[::1], f8, b1",
+    "dvo.nets.update.update_kernels:join": "f4[:,::1], f4[:,::1], u2[:,::1], u2[::1], u2[::1], f8, u2[:,::1]",
+    "dvo.nets.update.update_kernels:neighbours": "u2[:,::1], u2[:,::1], i8[::1], b1[::1], u2[:,::1]",
+    "dvo.nets.update.update_kernels:pool": "u2[:,::1], u2[:,::1], i8[:,::1], b1[:,::1], u2[:,::1]",
+    "dvo.nets.update.update_kernels:spread": "u2[:,::1], u2[:,::1], i8[::1]",
+    "dvo.nets.update.update_kernels:gate": "u2[:,::1], u2[:,::1], u2[:,::1], u2[::1], u2[::1], f8",
 }
-"""Those of a CPU that multiplies bfloat16, which come first there."""
+"""Those of a CPU that multiplies bfloat16, which come first there, and in place of those of the same name."""
 
 
 def needed() -> dict[str, str]:
     """Kernels of this machine, see :data:`KERNELS`."""
     from dvo.core.compiled import compiles_bfloat16
 
-    return BFLOAT16_KERNELS | KERNELS if compiles_bfloat16() else KERNELS
+    if not compiles_bfloat16():
+        return KERNELS
+    return BFLOAT16_KERNELS | {name: types for name, types in KERNELS.items() if name not in BFLOAT16_KERNELS}
 
 
 @cache

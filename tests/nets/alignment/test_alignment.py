@@ -213,3 +213,36 @@ def test_texture_is_that_of_a_ramp_both_ways():
     assert found.abs().max() < 1e-5  # one gradient alone
     bent = torch.where(x < 40, 3 * x, 3 * 40 + 2 * y)[None]
     assert texture(bent, ONE, torch.tensor([[40.0, 30.0]]).double(), 13)[0] > 1
+
+
+@given(seed=st.integers(0, 999), side=st.sampled_from([3, 5]), tilted=st.booleans())
+@settings(max_examples=30, deadline=None)
+def test_warps_decisions_and_texture_by_kernels_are_those_of_the_twins(seed, side, tilted):
+    generator = torch.Generator().manual_seed(seed)
+    ticks = torch.arange(float(side)) - side // 2
+    patch = torch.stack(torch.meshgrid(ticks, ticks, indexing="xy"), -1)
+    coords = patch @ (torch.eye(2) + torch.randn(40, 1, 2, 2, generator=generator)) + 20
+    coords[0] = torch.nan
+    tilts = 0.3 * torch.randn(40, 2, 2, generator=generator) if tilted else None
+    positions = torch.rand(40, 2, generator=generator) * torch.tensor([90.0, 70.0]) - 5
+    quality = torch.rand(2, 40, generator=generator) * torch.tensor([[1.2], [0.2]])
+    measured = positions + torch.randn(40, 2, generator=generator)
+    positions[1], quality[0, 2], quality[1, 3] = torch.nan, torch.nan, torch.nan
+    images = torch.rand(3, 60, 80, generator=generator) * 255
+    frames = torch.randint(0, 3, (40,), generator=generator)
+
+    def all_three():
+        decided = accept(Alignment(positions, *quality), measured, (80, 60), 4.0, AlignmentOptions())
+        return patch_warps(coords, tilts), decided, texture(images, frames, positions[4:], 13)
+
+    frames = frames[4:]
+    with pytest.MonkeyPatch.context() as patched:
+        found = []
+        for kernels in ("numba", "torch"):
+            patched.setenv("DVO_KERNELS", kernels)
+            found.append(all_three())
+    (warps, decided, strength), expected = found
+    torch.testing.assert_close(warps, expected[0], rtol=1e-5, atol=1e-5)
+    assert torch.equal(decided, expected[1])
+    torch.testing.assert_close(strength, expected[2], rtol=1e-3, atol=1e-3)
+    assert torch.equal(warps[0], torch.eye(2)) and not decided[1:4].any()

@@ -13,7 +13,7 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.schedule import training_schedule
 from dvo.models.weights import load_weights, save_weights
 from dvo.nets.patch.config import ModelConfig, preset
-from dvo.nets.patch.selection import SELECTIONS, random_centres, structure_score
+from dvo.nets.patch.selection import SELECTIONS, random_centres, score_at, structure_score
 from dvo.odometry.load import build_odometry
 from dvo.odometry.patch.config import TRACKER_PRESETS
 
@@ -123,3 +123,19 @@ def test_each_clip_of_a_batch_draws_from_its_own_generator():
 
     both = centres([0, 1], [5, 6])
     assert torch.equal(both[:1], centres([0], [5])) and torch.equal(both[1:], centres([1], [6]))
+
+
+@given(height=st.integers(8, 40), width=st.integers(8, 40), seed=st.integers(0, 99), last=st.booleans())
+@settings(max_examples=25, deadline=None)
+def test_scores_by_the_kernel_are_those_of_the_twin(height, width, seed, last):
+    images = noise(height, width, seed=seed)
+    images = images.permute(0, 1, 3, 4, 2).contiguous().permute(0, 1, 4, 2, 3) if last else images
+    places = [torch.arange(-(-size // 4)) for size in (width, height)]
+    points = torch.stack(torch.meshgrid(*places, indexing="xy"), -1).reshape(1, 1, -1, 2).expand(1, 2, -1, 2)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("DVO_KERNELS", "numba")
+        found = score_at(images, points)
+        patched.setenv("DVO_KERNELS", "torch")
+        expected = score_at(images, points)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-2)
+    torch.testing.assert_close(expected, structure_score(images).flatten(2))

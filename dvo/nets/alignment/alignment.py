@@ -289,9 +289,9 @@ def accept(
         from dvo.nets.alignment.alignment_kernels import accepted
 
         decided = torch.empty(len(measured), dtype=torch.bool)
-        arrays = (x.contiguous().numpy() for x in given)
+        positions, correlation, last_step, network = (x.contiguous().numpy() for x in given)
         limits = options.reach * pixels, options.last_step, options.correlation
-        accepted(*arrays, *size, half, *limits, decided.numpy())
+        accepted(positions, correlation, last_step, network, *size, half, *limits, decided.numpy())
         return decided
     x, y = found.positions.unbind(-1)
     inside = (x >= half) & (x <= size[0] - 1 - half) & (y >= half) & (y <= size[1] - 1 - half)

@@ -11,7 +11,7 @@ from dvo.core.compiled import compiled, part
 def _grey(image, x, y):
     """Sum of the colours of a pixel; outside the image that of the border."""
     x, y = min(max(x, 0), image.shape[2] - 1), min(max(y, 0), image.shape[1] - 1)
-    total = 0
+    total = np.int64(0)
     for colour in range(image.shape[0]):
         total += np.int64(image[colour, y, x])
     return total

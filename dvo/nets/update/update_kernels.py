@@ -29,7 +29,7 @@ def _normalise(row, weight, bias, eps, low, out):
     factor = np.float32(1) / np.sqrt(square / np.float32(count) + np.float32(eps))
     for c in range(count):
         value = (row[c] - mean) * factor * number(weight[c]) + number(bias[c])  # type: ignore[call-arg]
-        out[c] = stored(low if value < low else value, out[c])  # type: ignore[call-arg]
+        out[c] = stored(low if value < low else value, out[c])
 
 
 @compiled
@@ -93,7 +93,7 @@ def pool(value: Array, score: Array, members: Array, real: Array, out: Array) ->
                 for c in range(channels):
                     share = exponential(number(own[c]) - most[c])  # type: ignore[call-arg]
                     total[c] += share
-                    held[c] += share * number(given[c])  # type: ignore[call-arg]
+                    held[c] += share * number(given[c])
         for c in range(channels):
             out[g, c] = stored(held[c] / total[c], out[g, c])  # type: ignore[call-arg]
 
@@ -113,7 +113,7 @@ def gate(x: Array, gates: Array, residual: Array, weight: Array, bias: Array, ep
     for e in range(len(x)):
         for c in range(channels):
             share = np.float32(1) / (np.float32(1) + exponential(-number(gates[e, c])))  # type: ignore[call-arg]
-            row[c] = number(x[e, c]) + share * number(residual[e, c])  # type: ignore[call-arg]
+            row[c] = number(x[e, c]) + share * number(residual[e, c])
         if len(weight):
             _normalise(row, weight, bias, eps, np.float32(-np.inf), x[e])
         else:

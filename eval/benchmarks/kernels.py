@@ -32,6 +32,7 @@ from dvo.nets.correlation.edge_correlation import EdgeCorrelation
 from dvo.nets.patch.config import preset
 from dvo.nets.patch.encoder import normalise
 from dvo.nets.patch.patchifier import normalise_images
+from dvo.nets.patch.selection import score_at
 
 Call = Callable[[], Tensor]
 CPU = torch.device("cpu")
@@ -81,6 +82,37 @@ def normalisation(generator: torch.Generator, device: torch.device) -> tuple[str
     return "16 channels, 160x120", lambda: normalise(x.clone(), torch.nn.InstanceNorm2d(16), skip=skip)
 
 
+def scores(generator: torch.Generator, device: torch.device) -> tuple[str, Call]:
+    """Candidates of the patches of a frame."""
+    image = torch.randint(0, 256, (1, 1, 240, 320, 3), generator=generator, dtype=torch.uint8).permute(0, 1, 4, 2, 3)
+    places = torch.rand(1, 1, 96, 2, generator=generator) * torch.tensor([80.0, 60.0])
+    image, points = image.to(device), places.long().to(device)
+    return "96 positions, 320x240", lambda: score_at(image, points)
+
+
+def update(generator: torch.Generator, device: torch.device) -> tuple[str, Call]:
+    """Update operator, of float32 on the CPU."""
+    return of_update(generator, torch.float32)
+
+
+def of_update(generator: torch.Generator, dtype: torch.dtype) -> tuple[str, Call]:
+    """Update operator of the network ``small``, untrained, on the edges of a window, in one precision.
+
+    Args:
+        generator: of the input, and of the network the generator of torch.
+        dtype: of the network and of the correlation.
+    """
+    config, graph = preset("small"), full_graph(frames=9, patches=24, self_edges=False)
+    model = PatchVO(config).eval()
+    model = model.in_bfloat16() if dtype == torch.bfloat16 else model
+    state = torch.randn(1, len(graph), config.hidden_channels, generator=generator)
+    channels = config.correlation_channels // len(config.pyramid)
+    shape = (1, len(graph), channels)
+    levels = [torch.randn(shape, generator=generator).to(dtype) for _ in config.pyramid]
+    correlation = Correlation(levels, order="pixels_first")
+    return f"{len(graph)} edges", lambda: model.update(state, state, correlation, graph)[1]
+
+
 def window(generator: torch.Generator, device: torch.device) -> PatchProblem:
     """Window of a tracker, a batch of one."""
     frames, per_frame = 9, 24
@@ -124,6 +156,11 @@ KERNELS: dict[str, Callable[[torch.Generator, torch.device], tuple[str, Call]]] 
 }
 """By name: a function of a random generator and a device that returns a description of the size and a call to time,
 which asks :func:`dvo.core.kernels.use_kernels`."""
+OF_A_CPU: dict[str, Callable[[torch.Generator, torch.device], tuple[str, Call]]] = {
+    "scores of patches": scores,
+    "update operator": update,
+}
+"""The same where other devices compute the twin."""
 
 
 def encoder(generator: torch.Generator) -> tuple[str, Call, Call]:
@@ -138,18 +175,11 @@ def encoder(generator: torch.Generator) -> tuple[str, Call, Call]:
 
 
 def update_operator(generator: torch.Generator) -> tuple[str, Call, Call]:
-    """Update operator of the network ``small``, untrained, on the edges of a window in both precisions."""
-    config, graph = preset("small"), full_graph(frames=9, patches=24, self_edges=False)
-    state = torch.randn(1, len(graph), config.hidden_channels, generator=generator)
-    channels = config.correlation_channels // len(config.pyramid)
-    levels = [torch.randn(1, len(graph), channels, generator=generator) for _ in config.pyramid]
-    correlation = Correlation(levels, order="pixels_first")
-
-    def call(model: PatchVO) -> Call:
-        return lambda: model.update(state, state, correlation, graph)[1]
-
-    model = PatchVO(config).eval()
-    return f"{len(graph)} edges", call(model.in_bfloat16()), call(model)
+    """Update operator in both precisions."""
+    (size, half), (_, single) = (
+        of_update(torch.manual_seed(generator.initial_seed()), dtype) for dtype in (torch.bfloat16, torch.float32)
+    )
+    return size, half, single
 
 
 def correlation(generator: torch.Generator) -> tuple[str, Call, Call]:
@@ -210,7 +240,8 @@ def main() -> None:
     parser.add_argument("--only", default="", help="kernels whose names contain this")
     parser.add_argument("--repeats", type=int, default=20, help="(%(default)s)")
     options = parser.parse_args()
-    names = (*KERNELS, *PRECISIONS)
+    kernels = KERNELS | OF_A_CPU
+    names = (*kernels, *PRECISIONS)
     chosen = [name for name in names if options.only in name]
     if not chosen or options.repeats < 1:
         parser.error(f"no run: --only is part of {', '.join(names)}, --repeats at least 1")
@@ -219,8 +250,8 @@ def main() -> None:
     with torch.inference_mode():
         for name in chosen:
             generator = torch.manual_seed(0)  # also of untrained networks
-            if name in KERNELS:
-                size, call = KERNELS[name](generator, CPU)
+            if name in kernels:
+                size, call = kernels[name](generator, CPU)
                 kernel, twin, largest = compare(call, options.repeats, CPU)
             else:
                 size, half, single = PRECISIONS[name](generator)

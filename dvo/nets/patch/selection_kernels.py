@@ -4,17 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dvo.core.compiled import compiled, part
-
-
-@part
-def _grey(image, x, y):
-    """Sum of the colours of a pixel; outside the image that of the border."""
-    x, y = min(max(x, 0), image.shape[2] - 1), min(max(y, 0), image.shape[1] - 1)
-    total = np.int64(0)
-    for colour in range(image.shape[0]):
-        total += np.int64(image[colour, y, x])
-    return total
+from dvo.core.compiled import compiled
 
 
 @compiled
@@ -25,13 +15,20 @@ def structure_scores(image, points, stride, box, out):
     """
     colours, height, width = image.shape
     half = box // 2
+    grey = np.empty((box + 2, box + 2), np.int64)  # sums of the colours; outside the image those of its border
     for p in range(len(points)):
-        x, y = points[p, 0] * stride, points[p, 1] * stride
+        x, y = points[p, 0] * stride - half, points[p, 1] * stride - half
+        for i in range(box + 2):
+            v = min(max(y + i - 1, 0), height - 1)
+            for j in range(box + 2):
+                u = min(max(x + j - 1, 0), width - 1)
+                grey[i, j] = 0
+                for colour in range(colours):
+                    grey[i, j] += image[colour, v, u]
         xx = xy = yy = 0
-        for v in range(max(0, y - half), min(height, y + half + 1)):
-            for u in range(max(0, x - half), min(width, x + half + 1)):
-                across = _grey(image, u + 1, v) - _grey(image, u - 1, v)
-                down = _grey(image, u, v + 1) - _grey(image, u, v - 1)
+        for i in range(max(1, 1 - y), min(box, height - y) + 1):
+            for j in range(max(1, 1 - x), min(box, width - x) + 1):
+                across, down = grey[i, j + 1] - grey[i, j - 1], grey[i + 1, j] - grey[i - 1, j]
                 xx += across * across
                 xy += across * down
                 yy += down * down

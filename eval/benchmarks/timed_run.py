@@ -68,8 +68,8 @@ class Timed:
         peak_mb: largest memory of the process, less the images.
         ate_m, ate_percent: after alignment in Sim(3), each world on its own; nan where nothing was tracked.
         tracked: share of the frames with a pose.
-        calls: mean number of aten calls of ``track`` by kind of frame (:data:`KINDS` and ``all``); empty if they were
-            not counted, or the system has no network.
+        calls: mean number of aten calls of ``track`` by kind of frame (:data:`KINDS`, ``all`` and ``computing``);
+            empty if they were not counted, or the system has no network.
     """
 
     track_ms: list[float]
@@ -87,15 +87,24 @@ class CallCounter(TorchDispatchMode):
 
     Attributes:
         calls: number so far.
+        computing: those of them that fill memory: no views, and no conversions that give what they were given.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.calls = 0
+        self.calls = self.computing = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        self.calls += func.namespace == "aten"
-        return func(*args, **(kwargs or {}))
+        found = func(*args, **(kwargs or {}))
+        if func.namespace == "aten":
+            self.calls += 1
+            given = {x.untyped_storage().data_ptr() for x in args if isinstance(x, torch.Tensor)}
+            outputs = [
+                x for x in (found if isinstance(found, tuple | list) else (found,)) if isinstance(x, torch.Tensor)
+            ]
+            fills = any(x.untyped_storage().data_ptr() not in given for x in outputs) or not outputs
+            self.computing += func._schema.is_mutable or fills
+        return found
 
 
 def timed(odometry: Odometry, frames: Sequence[Frame]) -> tuple[Result, list[float], float, float]:
@@ -132,20 +141,22 @@ def counted(odometry: Odometry, frames: Sequence[Frame]) -> dict[str, float]:
         frames: one or more.
 
     Returns:
-        Of all frames, and of each of :data:`KINDS` that occurs. Frames that are lost or before the initialisation count
-        among all.
+        Of all frames, and of each of :data:`KINDS` that occurs; of all frames those that compute
+        (:class:`CallCounter`). Frames that are lost or before the initialisation count among all.
     """
-    calls, aligned = [], []
+    calls, computing, aligned = [], [], []
     for frame in frames:
         before = aligned_in_a_row(odometry)
         with CallCounter() as counter:
             odometry.track(frame)
         calls.append(counter.calls)
+        computing.append(counter.computing)
         aligned.append(aligned_in_a_row(odometry) > before)
     odometry.finish()
     kinds = kinds_of(odometry, aligned) if isinstance(odometry, PatchOdometry) else [""] * len(calls)
     rows = {kind: [number for number, own in zip(calls, kinds, strict=True) if own == kind] for kind in KINDS}
-    return {kind: float(np.mean(numbers)) for kind, numbers in (rows | {"all": calls}).items() if numbers}
+    rows |= {"all": calls, "computing": computing}
+    return {kind: float(np.mean(numbers)) for kind, numbers in rows.items() if numbers}
 
 
 def aligned_in_a_row(odometry: Odometry) -> int:

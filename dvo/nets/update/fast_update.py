@@ -74,9 +74,9 @@ def _gated(layer: GatedResidual, net: Tensor, norm: nn.LayerNorm | None) -> None
 
 
 def _norm(layer: nn.LayerNorm) -> tuple[Any, Any, float]:
-    return _array(layer.weight), _array(layer.bias), layer.eps
+    return _array(layer.weight.detach()), _array(layer.bias.detach()), layer.eps
 
 
 def _array(x: Tensor) -> Any:
     """Values of a tensor, or bits of one of bfloat16."""
-    return (x.detach().view(torch.uint16) if x.dtype == torch.bfloat16 else x.detach()).numpy()
+    return (x.view(torch.uint16) if x.dtype == torch.bfloat16 else x).numpy()

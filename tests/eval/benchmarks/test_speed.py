@@ -78,7 +78,11 @@ def test_calls_of_aten_are_counted_also_without_gradients():
     with CallCounter() as counter, torch.inference_mode():
         x = torch.ones(3)
         x.add_(x)
-    assert counter.calls == 2
+        assert (counter.calls, counter.computing) == (2, 2)
+        x[1:].unsqueeze(0).to(torch.float32).numpy()  # views, and what gives what it was given
+        assert counter.calls > 4 and counter.computing == 2
+        torch.stack((x, x)).unbind()
+    assert counter.computing == 3
 
 
 @pytest.mark.long
@@ -86,10 +90,10 @@ def test_calls_by_kind_of_frame():
     odometry = tracker(replace(SMALL, keyframe_motion=1e9))  # the first keyframe of three stays
     found = counted(odometry, frames(12))
     kinds = kinds_of(odometry, [False] * 12)
-    assert set(kinds) == {"keyframe", "dropped"} == set(found) - {"all"}
+    assert set(kinds) == {"keyframe", "dropped"} == set(found) - {"all", "computing"}
     share = kinds.count("keyframe") / 12
     assert found["all"] == pytest.approx(share * found["keyframe"] + (1 - share) * found["dropped"])
-    assert found["dropped"] > 50
+    assert found["dropped"] > 50 and 0 < found["computing"] < found["all"]
 
 
 def test_kinds_of_lost_repeated_and_aligned_frames():

@@ -175,11 +175,6 @@ class Window:
         return torch.cat([frame.context for frame in self.frames])
 
     @property
-    def matching(self) -> Tensor:
-        """``(n * M, C, p, p)`` matching features of the patches."""
-        return torch.cat([frame.matching for frame in self.frames])
-
-    @property
     def measured(self) -> Tensor | None:
         """``(n * M, 2)`` measured inverse depths and weights, see :class:`Keyframe`; None if no frame has any."""
         return self._of_patches([frame.measured for frame in self.frames])

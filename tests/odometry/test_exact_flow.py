@@ -27,7 +27,7 @@ class TrueFlow:
     def __init__(self, odometry, clip):
         self.odometry, self.clip = odometry, clip
 
-    def keep_maps(self, map_slot, maps):
+    def keep(self, keyframe, maps):
         pass
 
     def __call__(self, coords, graph):

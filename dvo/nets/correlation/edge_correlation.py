@@ -111,7 +111,7 @@ class EdgeCorrelation:
     def _lookup_bfloat16(self, at: Tensor, features: Tensor, kk: Tensor, frames: Tensor) -> Tensor:
         """Look-up in maps of bfloat16."""
         rounded = features.bfloat16()
-        if use_kernels(features, at) and multiplies_bfloat16(at.device):
+        if use_kernels(rounded, half=True) and use_kernels(at) and multiplies_bfloat16(at.device):
             from dvo.core.compiled import compiles_bfloat16
             from dvo.nets.correlation.edge_correlation_kernels import correlate_bfloat16
 

@@ -5,7 +5,7 @@ Its twin is :meth:`dvo.nets.update.update.Update.forward`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,17 +14,14 @@ from torch.nn import functional
 from dvo.map.edges import Groups, PatchGraph
 from dvo.nets.update import update_kernels as kernels
 
-if TYPE_CHECKING:
-    from dvo.nets.update.update import GatedResidual, SoftAggregation, Update
-
 
 def revise_by_kernels(
-    update: Update, hidden: Tensor, context: Tensor, first: Tensor, graph: PatchGraph
+    update: Any, hidden: Tensor, context: Tensor, first: Tensor, graph: PatchGraph
 ) -> tuple[Tensor, Tensor, Tensor]:
     """State, flow revision and confidence of the edges of one clip.
 
     Args:
-        update: the operator, of float32 or bfloat16.
+        update: the :class:`dvo.nets.update.update.Update`, of float32 or bfloat16.
         hidden, context: ``(E, D)`` float32.
         first: ``(E, D)`` output of the first layer of the correlation, of the type of the operator; is overwritten.
         graph: the edges and their neighbourhoods.
@@ -32,7 +29,7 @@ def revise_by_kernels(
     Returns:
         State ``(E, D)`` float32, flow revision ``(E, 2)`` and confidence ``(E, 2)`` of the type of the operator.
     """
-    encoder: Any = update.corr
+    encoder, recurrent = update.corr, update.gru
     seen = encoder[2](functional.relu_(first))
     kernels.normalise(_array(seen), *_norm(encoder[3]), True)
     seen = encoder[5](seen)
@@ -48,14 +45,13 @@ def revise_by_kernels(
     kernels.neighbours(_array(net), added, graph.previous.numpy(), graph.has_previous[:, 0].numpy(), _array(beside))
     _aggregate(update.agg_kk, net, graph.by_patch)
     _aggregate(update.agg_ij, net, graph.by_pair)
-    recurrent: Any = update.gru
     kernels.normalise(_array(net), *_norm(recurrent[0]), False)
     _gated(recurrent[1], net, recurrent[2])
     _gated(recurrent[3], net, None)
     return net.to(hidden.dtype), update.d(net), update.w(net)
 
 
-def _aggregate(layer: SoftAggregation, net: Tensor, groups: Groups) -> None:
+def _aggregate(layer: Any, net: Tensor, groups: Groups) -> None:
     """Add the aggregation of its features to ``net``, in place."""
     pooled = net.new_empty(len(groups.members), net.shape[1])
     kernels.pool(
@@ -64,9 +60,9 @@ def _aggregate(layer: SoftAggregation, net: Tensor, groups: Groups) -> None:
     kernels.spread(_array(net), _array(layer.h(pooled)), groups.group.numpy())
 
 
-def _gated(layer: GatedResidual, net: Tensor, norm: nn.LayerNorm | None) -> None:
+def _gated(layer: Any, net: Tensor, norm: nn.LayerNorm | None) -> None:
     """Apply a gated residual to ``net``, and perhaps a normalisation, in place."""
-    residual: Any = layer.res
+    residual = layer.res
     further = residual[2](functional.relu_(residual[0](net)))
     empty = _array(net)[0, :0]
     weight, bias, eps = (empty, empty, 0.0) if norm is None else _norm(norm)

@@ -110,9 +110,12 @@ class WindowCorrelation:
     """:class:`dvo.nets.correlation.correlation.CorrelationLookup` over a window.
 
     Args:
-        window: provides the edges and patch features.
-        model: the network, whose precision is that of the maps where the device multiplies it.
-        device: of the maps.
+        window: provides the edges.
+        model: the network, whose precision is that of maps and features where the device multiplies it.
+        device: of both.
+
+    Attributes:
+        features: ``(N, M, p^2, C)`` matching features of the patches by map slot, as the look-up takes them.
     """
 
     def __init__(self, window: Window, model: PatchVO, device: torch.device) -> None:
@@ -123,21 +126,28 @@ class WindowCorrelation:
         )
         dtype = torch.bfloat16 if half else torch.float32
         self.levels = [EdgeCorrelation(scale, config.radius, device, dtype) for scale in config.pyramid]
+        self.features = torch.zeros(0, 0, 0, 0, device=device, dtype=dtype)
 
     @property
     def capacity(self) -> int:
         """Number of frames that memory is reserved for."""
         return max(len(level.maps) for level in self.levels)
 
-    def keep_maps(self, map_slot: int, maps: Tensor) -> None:
-        """Store the feature maps of a frame.
+    def keep(self, keyframe: Keyframe, maps: Tensor) -> None:
+        """Store the features of a keyframe; the content of its map slot is overwritten.
 
         Args:
-            map_slot: slot of the frame; its content is overwritten.
+            keyframe: with the features of its patches.
             maps: ``(1, 1, C, h, w)`` matching features.
         """
+        slot, own = keyframe.map_slot, keyframe.matching.flatten(2).mT
         for level, pooled in zip(self.levels, pool_levels(maps, self.pyramid), strict=True):
-            level.keep_map(map_slot, pooled[0, 0])
+            level.keep_map(slot, pooled[0, 0])
+        missing = self.capacity - len(self.features)
+        if missing:
+            empty = self.features.new_zeros(missing, *own.shape)
+            self.features = torch.cat([self.features, empty]) if len(self.features) else empty
+        self.features[slot] = own
 
     def __call__(self, coords: Tensor, graph: PatchGraph) -> Correlation:
         """Look up the edges of the window, see :class:`dvo.nets.correlation.correlation.CorrelationLookup`.
@@ -149,10 +159,9 @@ class WindowCorrelation:
         Returns:
             Channels in the order ``pixels_first``.
         """
-        window = self.window
-        features = window.matching.flatten(2).mT.contiguous()
-        maps = window.map_slots[graph.jj]
-        found = [level.lookup(coords[0], features, graph.kk, maps)[None] for level in self.levels]
+        m, slots = self.window.per_frame, self.window.map_slots
+        features, maps, kk = self.features.flatten(0, 1), slots[graph.jj], slots[graph.ii] * m + graph.kk % m
+        found = [level.lookup(coords[0], features, kk, maps)[None] for level in self.levels]
         return Correlation(found, "pixels_first")
 
 
@@ -228,7 +237,7 @@ class PatchWindow:
         """
         assert keyframe.image is not None
         self.bounds = maps.shape[-1], maps.shape[-2]
-        self.correlation.keep_maps(keyframe.map_slot, maps)
+        self.correlation.keep(keyframe, maps)
         if self.alignment is not None:
             self.alignment.keep_image(keyframe.map_slot, keyframe.image)
         self.window.insert(position, keyframe, pose_cw, patches)

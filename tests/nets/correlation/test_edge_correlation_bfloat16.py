@@ -58,8 +58,9 @@ def test_the_kernel_is_used(monkeypatch):
 
     calls, kernel = [], edge_correlation_kernels.correlate_bfloat16
     monkeypatch.setattr(edge_correlation_kernels, "correlate_bfloat16", lambda *given: calls.append(kernel(*given)))
-    filled(64, 3, torch.bfloat16).lookup(*edges(64, 3, 1.0, 0))
-    assert len(calls) == 1
+    level, (coords, features, *rest) = filled(64, 3, torch.bfloat16), edges(64, 3, 1.0, 0)
+    found = [level.lookup(coords, given, *rest) for given in (features, features.bfloat16())]
+    assert len(calls) == 2 and torch.equal(*(x.nan_to_num(-1) for x in found))
 
 
 def test_no_kernel_for_another_cpu(monkeypatch):

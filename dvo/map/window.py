@@ -10,6 +10,7 @@ Frames are numbered in three ways:
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -266,25 +267,21 @@ class Window:
         self.weights = torch.cat([self.weights, self.weights.new_zeros(count, 2)])
         self.confidence = torch.cat([self.confidence, self.confidence.new_zeros(count, 2)])
 
-    def connect_frame(self, position: int, lifetime: int, own: bool) -> None:
-        """Add edges from the patches of the frames around a frame to it, and from its patches to them.
+    def connect_frame(self, position: int, distances: Collection[int], own: bool) -> None:
+        """Add edges from the patches of frames around a frame to it, and from its patches to them.
 
         Args:
             position: of the frame in the window; it has no edges yet.
-            lifetime: number of frames on either side of it that take part, beside guests.
+            distances: of the frames on either side of it that take part, in frames; guests do in any case.
             own: also from its patches to itself.
         """
-        m, device = self.per_frame, self.jj.device
-        first, end = max(0, position - lifetime), min(len(self), position + lifetime + 1)
-
-        def places(*ranges: tuple[int, int]) -> Tensor:
-            return torch.cat([torch.arange(*one, device=device) for one in ranges])
-
-        guests = 0, min(self.guests, first)
-        near, others = places(guests, (first, end)), places(guests, (first, position), (position + 1, end))
+        m, device, count = self.per_frame, self.jj.device, self.guests
+        near = [k for k in range(len(self)) if k < count or k == position or abs(k - position) in distances]
+        others = torch.tensor([k for k in near if k != position], dtype=torch.long, device=device)
         old = (others[:, None] * m + torch.arange(m, device=device)).flatten()
         self.connect(old, torch.full_like(old, position))
-        new, targets = torch.arange(position * m, (position + 1) * m, device=device), near if own else others
+        new = torch.arange(position * m, (position + 1) * m, device=device)
+        targets = torch.tensor(near, dtype=torch.long, device=device) if own else others
         self.connect(new.repeat_interleave(len(targets)), targets.repeat(m))
 
     def keep(self, mask: Tensor) -> None:

@@ -52,7 +52,7 @@ def test_a_frame_in_between_is_joined_with_both_sides_and_its_removal_leaves_not
     assert torch.equal(w.ii[:50] - (w.ii[:50] == 5).long(), indices["kk"] // 2)
     assert torch.equal(w.jj[:50] - (w.jj[:50] == 5).long(), indices["jj"])
     assert not w.touching(4).any()
-    w.connect_frame(4, 2, True)
+    w.connect_frame(4, (1, 2), True)
     pairs = {(int(i), int(j)) for i, j in zip(w.ii[50:], w.jj[50:], strict=True)}
     assert pairs == {(2, 4), (3, 4), (5, 4), (4, 2), (4, 3), (4, 4), (4, 5)} and len(w.kk) == 50 + 2 * 7
     w.remove(4)

@@ -83,6 +83,8 @@ class TrackerConfig:
         align_slope: standard deviation, 1 / feature pixel, of the slopes of surfaces that an alignment of measurements
             that leave the window finds too (:mod:`dvo.nets.patch.slopes`); 0: surfaces of constant depth.
         lifetime: largest distance, in frames, of the edges of a patch from its own frame.
+        edges: frames up to this distance that a patch has edges into: ``all``, or ``spread``, the next three, those 5,
+            8, 13, ... frames away, and the farthest, so that as many edges see a point from places farther apart.
         removal: age, in frames, above which the edges of a frame's patches are archived.
         optimisation: number of newest frames whose poses are optimised.
         final_adjustment: solve for all frames of a segment at once in ``finish``
@@ -155,9 +157,10 @@ class TrackerConfig:
     align_gain: float = 10.0
     align_reach: float = 0.3
     align_slope: float = 0.0
-    lifetime: int = 7
-    removal: int = 9
-    optimisation: int = 8
+    lifetime: int = 12
+    edges: Literal["all", "spread"] = "spread"
+    removal: int = 12
+    optimisation: int = 12
     initial_frames: int = 5
     initial_updates: int = 16
     final_updates: int = 2
@@ -225,13 +228,23 @@ class TrackerConfig:
         few, many = self.updates, self.search_updates
         joined = (Round(many, self.join_inliers),)
         searched = (Round(few, self.min_inliers), Round(many, self.search_inliers))
-        common = InsertPolicy(self.lifetime, self.optimisation, searched, self.lost_confidence)
+        common = InsertPolicy(self.distances, self.optimisation, searched, self.lost_confidence)
         return {
             "continuous": common,
             "retry": replace(common, rounds=joined),
             "late": replace(common, rounds=joined, later=1),
             "located": replace(common, rounds=(Round(many, 1.0),), checked=False),
         }
+
+    @cached_property
+    def distances(self) -> tuple[int, ...]:
+        """Distances of the edges of a patch from its own frame, in frames."""
+        if self.edges == "all":
+            return tuple(range(1, self.lifetime + 1))
+        found = [1, 2, 3]
+        while found[-1] < self.lifetime:
+            found.append(found[-2] + found[-1])
+        return tuple(sorted({min(distance, self.lifetime) for distance in found}))
 
     @property
     def aligned_motion(self) -> float:
@@ -272,13 +285,14 @@ class TrackerConfig:
 
 TRACKER_PRESETS: dict[str, TrackerConfig] = {
     "small": TrackerConfig(),
-    "mamba": TrackerConfig(initial_pose="nearest"),
-    "tiny": TrackerConfig(pixels=160 * 120, patches=16),
+    "mamba": TrackerConfig(initial_pose="nearest", lifetime=7, edges="all", removal=9, optimisation=8),
+    "tiny": TrackerConfig(pixels=160 * 120, patches=16, lifetime=7, edges="all", removal=9, optimisation=8),
     # DPVO's "fast" setting.
     "full": TrackerConfig(
         pixels=0,
         patches=48,
         lifetime=11,
+        edges="all",
         removal=16,
         optimisation=7,
         initial_frames=8,
@@ -295,6 +309,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "pixels": 256 * 192,
         "patches": 16,
         "lifetime": 5,
+        "edges": "all",
         "removal": 7,
         "optimisation": 7,
         "network_motion": 2.5,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Literal
@@ -64,7 +64,7 @@ class InsertPolicy:
     """How a frame is tried in a window.
 
     Attributes:
-        lifetime: number of frames on either side of it with which it is connected.
+        distances: of the frames on either side of it with which it is connected, in frames.
         optimised: number of newest frames whose poses are solved for.
         rounds: the first that supports the pose ends the try.
         confidence: mean confidence of the edges into it that is needed.
@@ -72,7 +72,7 @@ class InsertPolicy:
         checked: refuse a frame whose pose is not supported; otherwise it is taken, as its pose was checked before.
     """
 
-    lifetime: int
+    distances: tuple[int, ...]
     optimised: int
     rounds: tuple[Round, ...]
     confidence: float = 0.0
@@ -181,7 +181,7 @@ class PatchWindow:
     Example:
         >>> window = PatchWindow.empty(model, 24, StepSettings(), device)
         >>> keyframe = window.add(view, len(window), identifier, pose_cw, depth)
-        >>> window.connect(len(window) - 1, lifetime=7)
+        >>> window.connect(len(window) - 1, distances=(1, 2, 3, 5))
         >>> window.update(optimised=8)
     """
 
@@ -260,14 +260,14 @@ class PatchWindow:
         self.insert(position, keyframe, view.seen.maps, pose_cw, patches)
         return keyframe
 
-    def connect(self, position: int, lifetime: int) -> None:
+    def connect(self, position: int, distances: Collection[int]) -> None:
         """Add edges between a frame and those around it, both ways, and to itself if the network has such.
 
         Args:
             position: of the frame, which has no edges yet.
-            lifetime: number of frames on either side of it that take part, beside guests.
+            distances: of the frames on either side of it that take part, beside guests, in frames.
         """
-        self.window.connect_frame(position, lifetime, self.model.config.self_edges)
+        self.window.connect_frame(position, distances, self.model.config.self_edges)
 
     def try_insert(
         self, view: View, position: int, identifier: int, pose_cw: Tensor, depth: Tensor, policy: InsertPolicy
@@ -287,7 +287,7 @@ class PatchWindow:
         """
         before = self.snapshot()
         self.add(view, position, identifier, pose_cw, depth)
-        self.connect(position, policy.lifetime)
+        self.connect(position, policy.distances)
         support = PoseSupport(0.0, 0.0)
         for one in policy.rounds:
             self.update(policy.optimised, one.updates)

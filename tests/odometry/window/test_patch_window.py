@@ -104,7 +104,17 @@ def test_policies_follow_the_settings():
     assert policies["continuous"].rounds == (Round(2, 0.1), Round(5, 0.2))
     assert policies["retry"].rounds == policies["late"].rounds == (Round(5, 0.3),)
     assert (policies["retry"].later, policies["late"].later) == (0, 1) and not policies["located"].checked
-    assert all((one.lifetime, one.optimised) == (4, 4) for one in policies.values())
+    assert all((one.distances, one.optimised) == ((1, 2, 3, 4), 4) for one in policies.values())
+
+
+@pytest.mark.parametrize(
+    "edges, lifetime, distances",
+    [("all", 1, (1,)), ("all", 5, (1, 2, 3, 4, 5)), ("spread", 1, (1,)), ("spread", 3, (1, 2, 3)),
+     ("spread", 4, (1, 2, 3, 4)), ("spread", 5, (1, 2, 3, 5)), ("spread", 12, (1, 2, 3, 5, 8, 12)),
+     ("spread", 20, (1, 2, 3, 5, 8, 13, 20))],
+)  # fmt: skip
+def test_distances_of_edges(edges, lifetime, distances):
+    assert replace(SMALL, edges=edges, lifetime=lifetime).distances == distances
 
 
 @torch.inference_mode()

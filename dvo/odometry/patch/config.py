@@ -83,8 +83,8 @@ class TrackerConfig:
         align_slope: standard deviation, 1 / feature pixel, of the slopes of surfaces that an alignment of measurements
             that leave the window finds too (:mod:`dvo.nets.patch.slopes`); 0: surfaces of constant depth.
         lifetime: largest distance, in frames, of the edges of a patch from its own frame.
-        edges: frames up to this distance that a patch has edges into: ``all``, or ``spread``, the next three, those 5,
-            8, 13, ... frames away, and the farthest, so that as many edges see a point from places farther apart.
+        edges: frames up to this distance that a patch has edges into: ``all``, or ``spread``, the next four and every
+            second one of the others, so that as many edges see a point from places farther apart.
         removal: age, in frames, above which the edges of a frame's patches are archived.
         optimisation: number of newest frames whose poses are optimised.
         final_adjustment: solve for all frames of a segment at once in ``finish``
@@ -157,10 +157,10 @@ class TrackerConfig:
     align_gain: float = 10.0
     align_reach: float = 0.3
     align_slope: float = 0.0
-    lifetime: int = 12
+    lifetime: int = 10
     edges: Literal["all", "spread"] = "spread"
-    removal: int = 12
-    optimisation: int = 12
+    removal: int = 10
+    optimisation: int = 10
     initial_frames: int = 5
     initial_updates: int = 16
     final_updates: int = 2
@@ -239,12 +239,8 @@ class TrackerConfig:
     @cached_property
     def distances(self) -> tuple[int, ...]:
         """Distances of the edges of a patch from its own frame, in frames."""
-        if self.edges == "all":
-            return tuple(range(1, self.lifetime + 1))
-        found = [1, 2, 3]
-        while found[-1] < self.lifetime:
-            found.append(found[-2] + found[-1])
-        return tuple(sorted({min(distance, self.lifetime) for distance in found}))
+        every = range(1, self.lifetime + 1)
+        return tuple(d for d in every if self.edges == "all" or d <= 4 or d % 2 == 0 or d == self.lifetime)
 
     @property
     def aligned_motion(self) -> float:
@@ -309,7 +305,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "pixels": 256 * 192,
         "patches": 16,
         "lifetime": 5,
-        "edges": "all",
         "removal": 7,
         "optimisation": 7,
         "network_motion": 2.5,

@@ -435,7 +435,7 @@ class PatchOdometry:
         window, config, state, record = self.window, self.config, self.state, view.records[0]
         identifier, (pose, depth) = self._name(view), self._begin(view)
         self.patch_window.add(view, len(window), identifier, pose, depth)
-        self.patch_window.connect(len(window) - 1, config.distances)
+        self.patch_window.connect(len(window) - 1, range(1, config.lifetime + 1))  # in few frames all tell
         state.waited += 1
         if len(window) > 1:
             revision = self.patch_window.revise()

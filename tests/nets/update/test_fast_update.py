@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dvo.core.compiled import compiled
-from dvo.core.number_kernels import exponential
 from dvo.map.edges import build_graph
 from dvo.models.patch_vo import PatchVO
 from dvo.nets.correlation.correlation import Correlation
 from dvo.nets.patch.config import preset
 from dvo.nets.update import fast_update
+from dvo.nets.update.update_kernels import exponential
 
 
 @compiled

@@ -84,7 +84,7 @@ class TrackerConfig:
             that leave the window finds too (:mod:`dvo.nets.patch.slopes`); 0: surfaces of constant depth.
         lifetime: largest distance, in frames, of the edges of a patch from its own frame.
         edges: frames up to this distance that a patch has edges into: ``all``, or ``spread``, the next four and every
-            second one of the others, so that as many edges see a point from places farther apart.
+            second one of the others, so that as many edges see a point from places farther apart (docs/precision.md).
         removal: age, in frames, above which the edges of a frame's patches are archived.
         optimisation: number of newest frames whose poses are optimised.
         final_adjustment: solve for all frames of a segment at once in ``finish``
@@ -157,10 +157,10 @@ class TrackerConfig:
     align_gain: float = 10.0
     align_reach: float = 0.3
     align_slope: float = 0.0
-    lifetime: int = 10
-    edges: Literal["all", "spread"] = "spread"
-    removal: int = 10
-    optimisation: int = 10
+    lifetime: int = 7
+    edges: Literal["all", "spread"] = "all"
+    removal: int = 9
+    optimisation: int = 8
     initial_frames: int = 5
     initial_updates: int = 16
     final_updates: int = 2
@@ -281,14 +281,13 @@ class TrackerConfig:
 
 TRACKER_PRESETS: dict[str, TrackerConfig] = {
     "small": TrackerConfig(),
-    "mamba": TrackerConfig(initial_pose="nearest", lifetime=7, edges="all", removal=9, optimisation=8),
-    "tiny": TrackerConfig(pixels=160 * 120, patches=16, lifetime=7, edges="all", removal=9, optimisation=8),
+    "mamba": TrackerConfig(initial_pose="nearest"),
+    "tiny": TrackerConfig(pixels=160 * 120, patches=16),
     # DPVO's "fast" setting.
     "full": TrackerConfig(
         pixels=0,
         patches=48,
         lifetime=11,
-        edges="all",
         removal=16,
         optimisation=7,
         initial_frames=8,

@@ -27,10 +27,7 @@ from dvo.odometry.uncertainty.gauge import window_gauge
 from dvo.odometry.uncertainty.uncertainty import UNKNOWN, LaterUncertainty, WindowMeasurements, newest_uncertainty
 from dvo.synth.sequence import make_sequence
 
-FAST = {
-    "pixels": 160 * 120, "patches": 12, "lifetime": 5, "removal": 6, "optimisation": 8, "initial_updates": 6,
-    "restart": False,
-}  # fmt: skip
+FAST = {"pixels": 160 * 120, "patches": 12, "lifetime": 5, "removal": 6, "initial_updates": 6, "restart": False}
 
 
 def walk():

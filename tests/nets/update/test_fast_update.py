@@ -47,12 +47,11 @@ def random_update(seed, frames=5, per_frame=3, share=0.7):
 
 
 def by_both(operator, arguments, monkeypatch):
-    calls, kernel = [], fast_update.revise_by_kernels
-    monkeypatch.setattr(fast_update, "revise_by_kernels", lambda *given: calls.append(1) or kernel(*given))
-    found = []
-    with torch.inference_mode():
+    calls, kernel, found = [], fast_update.revise_by_kernels, []
+    with monkeypatch.context() as patch, torch.inference_mode():
+        patch.setattr(fast_update, "revise_by_kernels", lambda *given: calls.append(1) or kernel(*given))
         for kernels in ("numba", "torch"):
-            monkeypatch.setenv("DVO_KERNELS", kernels)
+            patch.setenv("DVO_KERNELS", kernels)
             found.append(operator(*arguments))
     assert len(calls) == 1
     return found
@@ -69,16 +68,19 @@ def test_kernels_give_what_the_twin_gives(seed, share):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_in_bfloat16_they_are_as_near_to_single_precision(seed, monkeypatch):
-    model, arguments = random_update(seed)
-    found, twin = by_both(model.in_bfloat16().update, arguments, monkeypatch)
-    with torch.no_grad():
-        exact = model.update(*arguments)
-    for one, other, wanted in zip(found, twin, exact, strict=True):
-        assert one.dtype == wanted.dtype
-        assert (one - wanted).abs().mean() <= 1.3 * (other - wanted).abs().mean() + 1e-4
-        assert (one - wanted).abs().max() < 0.1 * wanted.abs().max()
+def test_in_bfloat16_they_are_as_near_to_single_precision(monkeypatch):
+    """On average over operators: each of the few outputs of one is rounded its own way."""
+    sizes = torch.zeros(3, 3)  # by output: errors with kernels and of the twin, and the values
+    for seed in range(8):
+        model, arguments = random_update(seed)
+        found, twin = by_both(model.in_bfloat16().update, arguments, monkeypatch)
+        with torch.no_grad():
+            exact = model.update(*arguments)
+        for k, (one, other, wanted) in enumerate(zip(found, twin, exact, strict=True)):
+            assert one.dtype == wanted.dtype
+            sizes[k] += torch.stack([x.abs().mean() for x in (one - wanted, other - wanted, wanted)])
+    errors, of_twin, values = sizes.unbind(1)
+    assert (errors <= 1.3 * of_twin).all() and (errors < 0.05 * values).all()
 
 
 def test_nan_stays_with_the_edges_that_it_reaches(monkeypatch):

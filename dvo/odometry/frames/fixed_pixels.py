@@ -36,8 +36,6 @@ SAMPLES = 12
 """Samples before the first mask."""
 MEMORY = 24
 """Samples over which means are taken, about."""
-LOOK_EVERY = 3
-"""Images of which one is looked at after as many samples: the next tells little more, and each takes time."""
 FIXED_SHARES = (0.002, 0.6)
 """Least and largest share of the pixels with texture that are fixed, for a mask: where nearly all is fixed the camera
 stands still before something that moves."""
@@ -71,7 +69,7 @@ class FixedPixels:
         self.picture: np.ndarray | None = None
         self._moved: np.ndarray | None = None  # the mask without bars
         self._bars = Bars()
-        self._count = self._passed = 0  # samples, and images since the last look
+        self._count = 0
         self._last = self._mean = self._square = self._slope = self._across = np.zeros((0, 0), np.float32)
 
     def see(self, image: np.ndarray) -> bool:
@@ -97,10 +95,6 @@ class FixedPixels:
 
     def _sample(self, image: np.ndarray) -> bool:
         """Take the next image as a sample, if the picture has changed; True if :attr:`_moved` was made anew."""
-        self._passed += 1
-        if self._count >= MEMORY and self._passed < LOOK_EVERY:
-            return False
-        self._passed = 0
         grey, (dx, dy), slope = _grey_and_gradient(image)
         if not self._count:
             self._count, self._last, self._mean, self._square, self._slope = 1, grey, grey, grey**2, slope

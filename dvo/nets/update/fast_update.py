@@ -42,7 +42,7 @@ def revise_by_kernels(
         kernels.neighbours(_array(net), added, index.numpy(), has[:, 0].numpy(), _array(beside))
         found = layers[2](functional.relu_(layers[0](beside)))
         added = _array(found)
-    kernels.neighbours(_array(net), added, graph.previous.numpy(), graph.has_previous[:, 0].numpy(), _array(beside))
+    net += found
     _aggregate(update.agg_kk, net, graph.by_patch)
     _aggregate(update.agg_ij, net, graph.by_pair)
     kernels.normalise(_array(net), *_norm(recurrent[0]), False)

@@ -90,8 +90,18 @@ def load_kept(kernel: Any, types: str) -> None:
 @cache
 def compiles_bfloat16() -> bool:
     """Tell if kernels are compiled for this CPU, and it has instructions for products of bfloat16 (AVX-512 BF16)."""
+    return _has("avx512bf16")
+
+
+@cache
+def compiles_int8() -> bool:
+    """Tell if kernels are compiled for this CPU, and it has instructions for products of bytes (VNNI)."""
+    return _has("avx512vnni") or _has("avxvnni")
+
+
+def _has(feature: str) -> bool:
     another = any(getattr(config, name, None) for name in ("CPU_NAME", "CPU_FEATURES"))
-    return not another and bool(llvmlite.binding.get_host_cpu_features().get("avx512bf16"))
+    return not another and bool(llvmlite.binding.get_host_cpu_features().get(feature))
 
 
 def name_of(function: Callable[..., Any]) -> str:

@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from dvo.ba.options import BAOptions, damping_at
+from dvo.core.context import multiplies_bfloat16
 from dvo.geometry import se3
 from dvo.map.edges import PatchGraph
 from dvo.models.schedule import Stage, to_device, training_schedule
@@ -27,6 +28,7 @@ from dvo.nets.patch.config import PRESETS, ModelConfig
 from dvo.nets.patch.frame_encoder import FrameEncoder
 from dvo.nets.patch.patchifier import Patchifier, normalise_images, patch_coordinates
 from dvo.nets.patch.selection import SELECTIONS, PatchSelection
+from dvo.nets.update.int8 import with_int8_layers
 from dvo.nets.update.update import UPDATE_OPERATORS, Update
 
 __all__ = ["Mode", "PatchVO", "UpdateState"]
@@ -105,6 +107,26 @@ class PatchVO(nn.Module):
         model.patchify.bfloat16()
         if isinstance(model.update, Update):
             model.update.bfloat16()
+        return model
+
+    @torch.inference_mode(False)
+    def in_int8(self) -> PatchVO:
+        """Copy for inference whose gated update operator multiplies in 8 bits (:mod:`dvo.nets.update.int8`).
+
+        Its encoder is in bfloat16 where the processor multiplies that, and as it is elsewhere.
+
+        Returns:
+            The copy, in evaluation mode, on the CPU.
+
+        Example:
+            >>> model = PatchVO(preset("tiny")).in_int8()
+            >>> type(model.update.c1[0]).__name__
+            'Int8Linear'
+        """
+        half = multiplies_bfloat16(torch.device("cpu"))
+        model = self.in_bfloat16() if half else copy.deepcopy(self).eval().requires_grad_(False)
+        if isinstance(model.update, Update):
+            with_int8_layers(model.update, self.update, model.precision)
         return model
 
     def forward(

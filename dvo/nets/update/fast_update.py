@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from dvo.map.edges import Groups, PatchGraph
 from dvo.nets.update import update_kernels as kernels
+from dvo.nets.update.int8 import Int8Linear, Rows, array_of, pack_rows
 
 
 def revise_by_kernels(
@@ -30,22 +31,22 @@ def revise_by_kernels(
         State ``(E, D)`` float32, flow revision ``(E, 2)`` and confidence ``(E, 2)`` of the type of the operator.
     """
     encoder, recurrent = update.corr, update.gru
-    seen = encoder[2](functional.relu_(first))
-    kernels.normalise(_array(seen), *_norm(encoder[3]), True)
-    seen = encoder[5](seen)
+    seen = _linear(encoder[2], first, rectified=True)
+    kernels.normalise(array_of(seen), *_norm(encoder[3]), True)
+    seen = _linear(encoder[5], seen)
     net = torch.empty_like(seen)
-    kernels.join(_array(hidden), _array(context), _array(seen), *_norm(update.norm), _array(net))
-    beside, added = seen, _array(seen)[:0]
+    kernels.join(array_of(hidden), array_of(context), array_of(seen), *_norm(update.norm), array_of(net))
+    beside, added = seen, array_of(seen)[:0]
     for layers, index, has in (
         (update.c1, graph.previous, graph.has_previous), (update.c2, graph.following, graph.has_following)
     ):  # fmt: skip
-        kernels.neighbours(_array(net), added, index.numpy(), has[:, 0].numpy(), _array(beside))
-        found = layers[2](functional.relu_(layers[0](beside)))
-        added = _array(found)
+        kernels.neighbours(array_of(net), added, index.numpy(), has[:, 0].numpy(), array_of(beside))
+        found = _linear(layers[2], _linear(layers[0], beside), rectified=True)
+        added = array_of(found)
     net += found
     _aggregate(update.agg_kk, net, graph.by_patch)
     _aggregate(update.agg_ij, net, graph.by_pair)
-    kernels.normalise(_array(net), *_norm(recurrent[0]), False)
+    kernels.normalise(array_of(net), *_norm(recurrent[0]), False)
     _gated(recurrent[1], net, recurrent[2])
     _gated(recurrent[3], net, None)
     return net.to(hidden.dtype), update.d(net), update.w(net)
@@ -54,25 +55,39 @@ def revise_by_kernels(
 def _aggregate(layer: Any, net: Tensor, groups: Groups) -> None:
     """Add the aggregation of its features to ``net``, in place."""
     pooled = net.new_empty(len(groups.members), net.shape[1])
+    given = _shared(layer.f, net)
     kernels.pool(
-        _array(layer.f(net)), _array(layer.g(net)), groups.members.numpy(), groups.mask[..., 0].numpy(), _array(pooled)
+        array_of(_linear(layer.f, given)),
+        array_of(_linear(layer.g, given)),
+        groups.members.numpy(),
+        groups.mask[..., 0].numpy(),
+        array_of(pooled),
     )
-    kernels.spread(_array(net), _array(layer.h(pooled)), groups.group.numpy())
+    kernels.spread(array_of(net), array_of(_linear(layer.h, pooled)), groups.group.numpy())
 
 
 def _gated(layer: Any, net: Tensor, norm: nn.LayerNorm | None) -> None:
     """Apply a gated residual to ``net``, and perhaps a normalisation, in place."""
-    residual = layer.res
-    further = residual[2](functional.relu_(residual[0](net)))
-    empty = _array(net)[0, :0]
+    residual, given = layer.res, _shared(layer.gate[0], net)
+    further = _linear(residual[2], _linear(residual[0], given), rectified=True)
+    empty = array_of(net)[0, :0]
     weight, bias, eps = (empty, empty, 0.0) if norm is None else _norm(norm)
-    kernels.gate(_array(net), _array(layer.gate[0](net)), _array(further), weight, bias, eps)
+    kernels.gate(array_of(net), array_of(_linear(layer.gate[0], given)), array_of(further), weight, bias, eps)
 
 
 def _norm(layer: nn.LayerNorm) -> tuple[Any, Any, float]:
-    return _array(layer.weight.detach()), _array(layer.bias.detach()), layer.eps
+    return array_of(layer.weight.detach()), array_of(layer.bias.detach()), layer.eps
 
 
-def _array(x: Tensor) -> Any:
-    """Values of a tensor, or bits of one of bfloat16."""
-    return (x.view(torch.uint16) if x.dtype == torch.bfloat16 else x).numpy()
+def _shared(layer: nn.Linear, x: Tensor) -> Tensor | Rows:
+    """What this layer and others like it take: ``x``, rounded once for all of them."""
+    return pack_rows(x) if isinstance(layer, Int8Linear) else x
+
+
+def _linear(layer: nn.Linear, given: Tensor | Rows, *, rectified: bool = False) -> Tensor:
+    """Apply a layer to numbers, perhaps rectified (in place), or to what :func:`_shared` gives."""
+    if isinstance(layer, Int8Linear):
+        return layer.multiply(given if isinstance(given, Rows) else pack_rows(given, rectified=rectified))
+    assert isinstance(given, Tensor)
+    found: Tensor = layer(functional.relu_(given) if rectified else given)
+    return found

@@ -20,6 +20,7 @@ from dvo.core.registry import Registry
 from dvo.map.edges import Groups, PatchGraph
 from dvo.nets.correlation.correlation import Correlation
 from dvo.nets.patch.config import ModelConfig
+from dvo.nets.update.int8 import Int8Linear, has_kernels
 
 UPDATE_OPERATORS = Registry(
     "update operator",
@@ -169,6 +170,9 @@ def first_layer(layer: nn.Linear, correlation: Correlation, taps: int) -> Tensor
         ``(B, E, D)``.
     """
     levels = correlation.levels
+    if isinstance(layer, Int8Linear):
+        ordered = partial(_ordered, layer.weight, len(levels), correlation.order, taps)
+        return layer.of_parts(levels, correlation.order, lambda: torch.cat(ordered(), 1))
     weights = _weights_of_levels(layer, correlation, taps)
     learn = correlation.learn
     plain = learn is None or is_transformed() or torch.is_autocast_enabled(learn.device.type)
@@ -340,4 +344,5 @@ class Update(nn.Module):
     def _takes_kernels(self, *given: Tensor) -> bool:
         """True where nothing is differentiated, on a CPU (:mod:`dvo.nets.update.fast_update`)."""
         plain = not torch.is_grad_enabled() and not torch.is_autocast_enabled("cpu")
+        plain = plain and not (isinstance(self.corr[0], Int8Linear) and not has_kernels())
         return plain and self.norm.weight.dtype in (torch.float32, torch.bfloat16) and use_kernels(*given)

@@ -28,8 +28,9 @@ C = TypeVar("C", bound="DataclassInstance")
 
 Policy = Literal["continuous", "retry", "late", "located"]
 """What a frame follows that is tried in the window."""
-Precision = Literal["auto", "float32", "bfloat16"]
-"""Type of the numbers that the network multiplies; ``auto``: bfloat16 on a CPU with instructions for it."""
+Precision = Literal["auto", "float32", "bfloat16", "int8"]
+"""Type of the numbers that the network multiplies. ``int8``: the update operator in 8 bits, and the encoder in bfloat16
+on a CPU with instructions for it. ``auto``: int8 or bfloat16 on a CPU with instructions for it, the faster one."""
 InitialPose = Literal["motion", "nearest"]
 """First pose of a new frame: of the motion model, or from matches with the newest keyframe."""
 

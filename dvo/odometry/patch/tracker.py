@@ -27,6 +27,7 @@ from dvo.map.keyframe_log import FrameRecord
 from dvo.map.window import Window
 from dvo.models.patch_vo import PatchVO
 from dvo.nets.patch.masks import visible_features
+from dvo.nets.update.int8 import multiplies_int8
 from dvo.odometry.depth.depth_factor import MEASURED_SHARE, measured_share
 from dvo.odometry.depth.patch_depth import measure_depth
 from dvo.odometry.exclusive import exclusive
@@ -36,7 +37,7 @@ from dvo.odometry.frames.gate import Admitted, Gate, missing_content
 from dvo.odometry.global_ba.graph_adjustment import AdjustmentRecord
 from dvo.odometry.global_ba.rolling_shutter import Shutter
 from dvo.odometry.loops.relocalisation import REFRESH_EVERY, hold_to_map, invite
-from dvo.odometry.patch.config import TrackerConfig
+from dvo.odometry.patch.config import Precision, TrackerConfig
 from dvo.odometry.patch.finishing import finish_segments, judge_result, run_information
 from dvo.odometry.patch.inertial import InertialTracking
 from dvo.odometry.patch.initial_pose import first_depth, first_pose
@@ -91,6 +92,7 @@ class PatchOdometry:
     Attributes:
         model: the network as it was given.
         network: the same in the precision that it tracks with.
+        precision: its name.
         gate: that every frame has to pass.
         graph: window, archive and log of frames.
         state: all else that a frame changes.
@@ -117,8 +119,11 @@ class PatchOdometry:
         self.name, self.config, self.seed, self.weights = name, config, seed, weights
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
-        half = config.precision == "bfloat16" or config.precision == "auto" and multiplies_bfloat16(self.device)
-        self.network = self.model.in_bfloat16() if half else self.model
+        self.precision: Precision = _fastest(self.device) if config.precision == "auto" else config.precision
+        if self.precision == "int8":
+            self.network = self.model.in_int8()
+        else:
+            self.network = self.model.in_bfloat16() if self.precision == "bfloat16" else self.model
         self.archive = archive
         if self.device.type == "cpu":
             load_in_background()
@@ -249,7 +254,7 @@ class PatchOdometry:
             seen = measure_depth(self.network, seen, admitted.frame, self.config.scale, self.config.measuring)
         state.info = {
             "working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist(),
-            "precision": "float32" if self.network is self.model else "bfloat16",
+            "precision": self.precision,
         }  # fmt: skip
         state.checks.see(len(self.graph.log.frames) - 1, image, seen.image_intrinsics, mask)
         estimate = self._take(View([record], seen))
@@ -570,3 +575,10 @@ class PatchOdometry:
 
     def _pose_wc(self, position: int) -> np.ndarray:
         return se3.inverse(self.window.poses_cw[position]).double().cpu().numpy()
+
+
+def _fastest(device: torch.device) -> Precision:
+    """Precision in which the network is fastest."""
+    if multiplies_int8(device):
+        return "int8"
+    return "bfloat16" if multiplies_bfloat16(device) else "float32"

@@ -37,7 +37,7 @@ def is_plain(arguments):
     return isinstance(compiled_meanwhile(arguments), contextlib.nullcontext)
 
 
-ALL = of_tracker.KERNELS | of_tracker.BFLOAT16_KERNELS
+ALL = of_tracker.KERNELS | of_tracker.BFLOAT16_KERNELS | of_tracker.INT8_BFLOAT16_KERNELS
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -58,11 +58,16 @@ def test_kernels_are_imported_without_torch():
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-@pytest.mark.parametrize("multiplies", [True, False])
-def test_those_for_bfloat16_are_for_such_machines_alone(multiplies, monkeypatch):
+@pytest.mark.parametrize("half", [True, False])
+@pytest.mark.parametrize("int8", [True, False])
+def test_those_for_lower_precision_are_for_such_machines_alone(half, int8, monkeypatch):
     """No other can compile them."""
-    monkeypatch.setattr("dvo.core.compiled.compiles_bfloat16", lambda: multiplies)
-    assert of_tracker.needed() == (ALL if multiplies else of_tracker.KERNELS)
+    monkeypatch.setattr("dvo.core.compiled.compiles_bfloat16", lambda: half)
+    monkeypatch.setattr("dvo.core.compiled.prefers_int8", lambda: int8)
+    expected = of_tracker.KERNELS | (of_tracker.BFLOAT16_KERNELS if half else {})
+    if int8:
+        expected |= of_tracker.INT8_BFLOAT16_KERNELS if half else of_tracker.INT8_KERNELS
+    assert of_tracker.needed() == expected
 
 
 def test_no_process_where_it_would_be_of_no_use(cold, monkeypatch):

@@ -99,6 +99,11 @@ def compiles_int8() -> bool:
     return _has("avx512vnni") or _has("avxvnni")
 
 
+def prefers_int8() -> bool:
+    """Tell if products of bytes are the fastest of this CPU; units for matrices (AMX) are faster."""
+    return compiles_int8() and not _has("amx-tile")
+
+
 def _has(feature: str) -> bool:
     another = any(getattr(config, name, None) for name in ("CPU_NAME", "CPU_FEATURES"))
     return not another and bool(llvmlite.binding.get_host_cpu_features().get(feature))

@@ -106,7 +106,7 @@ def available() -> bool:
     Raises:
         DvoError: see :func:`use_kernels`.
     """
-    return _chosen() == CHOICES[0] and _imported()
+    return _chosen() == CHOICES[0] and imported()
 
 
 def _chosen() -> str:
@@ -116,7 +116,8 @@ def _chosen() -> str:
     return chosen
 
 
-def _imported() -> bool:
+def imported() -> bool:
+    """Tell if numba can be imported; if it cannot, one line says so."""
     if _FOUND:
         return True
     with _IMPORTING:  # a line of two threads would be two

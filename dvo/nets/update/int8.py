@@ -8,31 +8,33 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from dvo.core.kernels import available, use_kernels
+from dvo.core.kernels import available, imported, use_kernels
 
 Array = Any
 
 
-@cache
 def multiplies_int8(device: torch.device) -> bool:
-    """Tell if layers in 8 bits are the fastest on a device: a CPU whose vectors multiply bytes and that has no units
-    for matrices, which are faster with bfloat16 (AMX), and kernels.
+    """Tell if layers in 8 bits are fastest on a device: a CPU whose vectors multiply bytes (AVX-512 VNNI, AVX-VNNI).
+
+    Units for matrices (AMX) are faster, with bfloat16.
 
     Args:
         device: any.
     """
-    known = getattr(torch.cpu, "_is_amx_tile_supported", None)  # torch 2.6 and newer
-    return device.type == "cpu" and not (known is not None and known()) and has_kernels()
+    if device.type != "cpu" or not imported():
+        return False
+    from dvo.core.compiled import prefers_int8
+
+    return prefers_int8()
 
 
 def has_kernels() -> bool:
-    """Tell if kernels are wanted, and this CPU has instructions for those of this module."""
+    """Tell if kernels are wanted, and compiled for a CPU with instructions for products of bytes."""
     if not available():
         return False
     from dvo.core.compiled import compiles_int8
@@ -84,7 +86,8 @@ def multiply_rounded(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """
     levels, scale, offset = round_rows(x)
     whole, size = round_weights(weight)
-    sums = (levels.double() @ whole.double().mT).float()
+    exact = torch.float32 if 255 * 127 * x.shape[-1] < 2**24 else torch.float64
+    sums = (levels.to(exact) @ whole.to(exact).mT).float()
     return sums * (scale * size[:, 0]) + (offset * (whole * size).sum(1) + bias)
 
 
@@ -160,14 +163,12 @@ class Int8Linear(nn.Linear):
         Returns:
             ``(..., D)``.
         """
-        whole = parts[0] if len(parts) == 1 else None
         if self._takes_kernels(*parts):
             first, *others = (x.flatten(0, -2).contiguous() for x in parts)
             further = torch.cat(others, 1) if len(others) > 1 else others[0] if others else None
             found = self.multiply(pack_rows(first, further), order, weight)
             return found.view(*parts[0].shape[:-1], self.out_features)
-        whole = torch.cat(list(parts), -1) if whole is None else whole
-        return multiply_rounded(whole, weight(), self.bias).to(self.gives)
+        return multiply_rounded(torch.cat(list(parts), -1), weight(), self.bias).to(self.gives)
 
     def multiply(self, rows: Rows, order: str = "", weight: Callable[[], Tensor] | None = None) -> Tensor:
         """Apply the layer by a kernel; its twin is :func:`multiply_rounded`.

@@ -111,13 +111,27 @@ BFLOAT16_KERNELS = {
 """Those of a CPU that multiplies bfloat16, which come first there, and in place of those of the same name."""
 
 
+INT8_KERNELS = {
+    "dvo.nets.update.int8_kernels:quantise": "f4[:,::1], f4[:,::1], b1, u4[:,:,::1], f4[::1], f4[::1]",
+    "dvo.nets.update.int8_kernels:multiply": ("u4[:,:,::1], f4[::1], f4[::1], i1[:,:,:,::1], f4[:,:,::1], f4[:,::1]"),
+}
+"""Those of a CPU that tracks in 8 bits, and of float32 in what is not."""
+INT8_BFLOAT16_KERNELS = {
+    "dvo.nets.update.int8_kernels:quantise": "u2[:,::1], u2[:,::1], b1, u4[:,:,::1], f4[::1], f4[::1]",
+    "dvo.nets.update.int8_kernels:multiply": ("u4[:,:,::1], f4[::1], f4[::1], i1[:,:,:,::1], f4[:,:,::1], u2[:,::1]"),
+}
+"""Those of one that multiplies bfloat16 too."""
+
+
 def needed() -> dict[str, str]:
     """Kernels of this machine, see :data:`KERNELS`."""
-    from dvo.core.compiled import compiles_bfloat16
+    from dvo.core.compiled import compiles_bfloat16, prefers_int8
 
-    if not compiles_bfloat16():
-        return KERNELS
-    return BFLOAT16_KERNELS | {name: types for name, types in KERNELS.items() if name not in BFLOAT16_KERNELS}
+    half, bytes_too = compiles_bfloat16(), prefers_int8()
+    first = (BFLOAT16_KERNELS if half else {}) | (
+        (INT8_BFLOAT16_KERNELS if half else INT8_KERNELS) if bytes_too else {}
+    )
+    return first | {name: types for name, types in KERNELS.items() if name not in first}
 
 
 @cache

@@ -28,6 +28,7 @@ from dvo.map.window import Window
 from dvo.models.patch_vo import PatchVO
 from dvo.nets.patch.masks import visible_features
 from dvo.nets.update.int8 import multiplies_int8
+from dvo.nets.update.update import Update
 from dvo.odometry.depth.depth_factor import MEASURED_SHARE, measured_share
 from dvo.odometry.depth.patch_depth import measure_depth
 from dvo.odometry.exclusive import exclusive
@@ -119,7 +120,7 @@ class PatchOdometry:
         self.name, self.config, self.seed, self.weights = name, config, seed, weights
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
-        self.precision: Precision = _fastest(self.device) if config.precision == "auto" else config.precision
+        self.precision = _precision(config.precision, self.model, self.device)
         if self.precision == "int8":
             self.network = self.model.in_int8()
         else:
@@ -577,8 +578,14 @@ class PatchOdometry:
         return se3.inverse(self.window.poses_cw[position]).double().cpu().numpy()
 
 
-def _fastest(device: torch.device) -> Precision:
-    """Precision in which the network is fastest."""
-    if multiplies_int8(device):
+def _precision(wanted: Precision, model: PatchVO, device: torch.device) -> Precision:
+    """Precision that the network tracks in: the wanted one, or the fastest on the device."""
+    gated = isinstance(model.update, Update)
+    if wanted == "int8" and not gated:
+        remedy = "use auto, float32 or bfloat16"
+        raise DvoError("only the gated update operator multiplies in 8 bits", field="precision", remedy=remedy)
+    if wanted != "auto":
+        return wanted
+    if gated and multiplies_int8(device):
         return "int8"
     return "bfloat16" if multiplies_bfloat16(device) else "float32"

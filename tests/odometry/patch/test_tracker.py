@@ -56,12 +56,19 @@ def test_precision_is_that_of_the_setting_or_of_the_processor(monkeypatch):
         (False, "bfloat16", torch.bfloat16),
     ):  # fmt: skip
         monkeypatch.setattr("dvo.odometry.patch.tracker.multiplies_bfloat16", lambda device, units=units: units)
+        monkeypatch.setattr("dvo.odometry.patch.tracker.multiplies_int8", lambda device: False)
         odometry = tracker(replace(SMALL, precision=precision))
         assert {p.dtype for p in odometry.network.parameters()} == {dtype}
         assert {p.dtype for p in odometry.model.parameters()} == {torch.float32}
-    results = [run(tracker(replace(SMALL, precision="bfloat16")), frames(9))[1] for _ in range(2)]
-    assert results[0].info["precision"] == "bfloat16" and results[0].frames_lost == 0
-    assert results[0].trajectory.poses_wc.tobytes() == results[1].trajectory.poses_wc.tobytes()
+    monkeypatch.setattr("dvo.odometry.patch.tracker.multiplies_int8", lambda device: True)
+    assert tracker(SMALL).precision == "int8"
+    assert tracker(SMALL, operator="mamba").precision == "float32"
+    for precision in ("bfloat16", "int8"):
+        results = [run(tracker(replace(SMALL, precision=precision)), frames(9))[1] for _ in range(2)]
+        assert results[0].info["precision"] == precision and results[0].frames_lost == 0
+        assert results[0].trajectory.poses_wc.tobytes() == results[1].trajectory.poses_wc.tobytes()
+    with pytest.raises(DvoError, match="precision.*gated"):
+        tracker(replace(SMALL, precision="int8"), operator="mamba")
 
 
 @pytest.mark.slow

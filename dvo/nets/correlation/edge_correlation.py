@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dvo.core.context import multiplies_bfloat16
-from dvo.core.kernels import use_device_kernels, use_kernels
+from dvo.core.kernels import available, use_device_kernels, use_kernels
 
 # Map slots that memory is reserved for at first, on a CPU and on other devices. On a CPU a page takes memory once it is
 # written to: there they are as many as a window has, so that no frame waits for a copy of all maps.
@@ -31,10 +31,14 @@ class EdgeCorrelation:
         radius: correlation radius in pixels of the level.
         device: of the maps.
         dtype: of the maps, and of the channels; bfloat16 is for a CPU that multiplies it. Features are rounded as the
-            maps are, and sums are float32.
+            maps are, and sums are float32. With uint8, pixels of maps and features are rounded to whole numbers and a
+            scale (:func:`round_channels`), for a CPU that multiplies bytes; channels are then float32, or bfloat16
+            where it multiplies that too.
 
     Attributes:
         maps: ``(N, H, W, C)`` features by map slot, each in a border of ``2 radius + 2`` zeros; others are not defined.
+            Whole numbers are stored above 128.
+        scales: ``(N, H, W)`` of the whole numbers, 0 in the border; empty for other types.
 
     Example:
         >>> level = EdgeCorrelation(scale=1, radius=3, device="cpu")
@@ -50,6 +54,7 @@ class EdgeCorrelation:
     ) -> None:
         self.scale, self.radius = scale, radius
         self.maps = torch.zeros(0, 0, 0, 0, device=device, dtype=dtype)
+        self.scales = torch.zeros(0, 0, 0, device=device)
 
     def keep_map(self, slot: int, level: Float[Tensor, "C h w"]) -> None:
         """Store the features of a frame; the storage grows with the largest slot, by doubling.
@@ -66,8 +71,15 @@ class EdgeCorrelation:
             if have:
                 grown[:have] = self.maps
             self.maps = grown
+            if grown.dtype == torch.uint8:
+                more = self.scales.new_zeros(len(grown) - have, *grown.shape[1:3])
+                self.scales = torch.cat([self.scales, more]) if have else more
+        inside = slice(border, border + h), slice(border, border + w)
+        if self.maps.dtype == torch.uint8:
+            self.maps[slot][inside], self.scales[slot][inside], _ = round_channels(level.permute(1, 2, 0), above=128)
+            return
         self.maps[slot].zero_()
-        self.maps[slot, border : border + h, border : border + w] = level.permute(1, 2, 0)
+        self.maps[slot][inside] = level.permute(1, 2, 0)
 
     def lookup(
         self,
@@ -75,6 +87,7 @@ class EdgeCorrelation:
         features: Float[Tensor, "K q C"],
         kk: Int[Tensor, " E"],
         frames: Int[Tensor, " E"],
+        numbers: Float[Tensor, "K q 2"] | None = None,
     ) -> Float[Tensor, "E c"]:
         """Correlation channels of this level.
 
@@ -83,12 +96,15 @@ class EdgeCorrelation:
             features: of the ``q = p^2`` pixels of each patch, channels last.
             kk: patch of each edge.
             frames: map slot of the target frame of each edge.
+            numbers: scale and total of features that are rounded already, if they are (:func:`round_channels`).
 
         Returns:
             ``c = p^2 * (2r+1)^2`` channels, ordered ``pixels_first``: patch row, patch column, y offset, x offset. NaN
             for a pixel whose position is not a number.
         """
         at = (coords.flatten(1, 2) / self.scale).contiguous()
+        if self.maps.dtype == torch.uint8:
+            return self._lookup_bytes(at, features, kk, frames, numbers).flatten(1)
         if self.maps.dtype == torch.bfloat16:
             return self._lookup_bfloat16(at, features, kk, frames).flatten(1)
         if use_kernels(self.maps, features, at):
@@ -122,6 +138,66 @@ class EdgeCorrelation:
                 correlate_bfloat16(maps, bits, at.numpy(), kk.numpy(), frames.numpy(), self.radius, found)
                 return out
         return correlate_edges(self.maps, rounded.float(), at, kk, frames, self.radius).bfloat16()
+
+    def _lookup_bytes(self, at: Tensor, features: Tensor, kk: Tensor, frames: Tensor, numbers: Tensor | None) -> Tensor:
+        """Look-up in maps of whole numbers."""
+        if numbers is None:
+            features, scale, total = round_channels(features)
+            numbers = torch.stack([scale, total], -1)
+        half = multiplies_bfloat16(at.device)
+        if use_kernels(at) and fits_bytes(features.shape[-1], self.radius):
+            from dvo.nets.correlation.edge_correlation_kernels import correlate_bytes
+
+            side = 2 * self.radius + 1
+            out = at.new_empty(*at.shape[:2], side, side, dtype=torch.bfloat16 if half else torch.float32)
+            correlate_bytes(
+                self.maps.numpy(), self.scales.numpy(), features.numpy(), numbers.numpy(), at.numpy(), kk.numpy(),
+                frames.numpy(), self.radius, (out.view(torch.uint16) if half else out).numpy(),
+            )  # fmt: skip
+            return out
+        maps = (self.maps.float() - 128) * self.scales[..., None]
+        found = correlate_edges(maps, features.float() * numbers[..., :1], at, kk, frames, self.radius)
+        return found.bfloat16() if half else found
+
+
+def round_channels(x: Float[Tensor, "h w C"], *, above: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Round the channels of pixels to whole numbers of -127 to 127, with a scale for each pixel.
+
+    Args:
+        x: the channels.
+        above: what is added to the numbers.
+
+    Returns:
+        The numbers ``(h, w, C)``, uint8 if something is added and int8 otherwise; float32 ``(h, w)`` scales, NaN where
+        a channel is not finite; and float32 ``(h, w)`` 128 times the sums of the numbers, without what is added.
+    """
+    kind = torch.uint8 if above else torch.int8
+    if use_kernels(x):
+        from dvo.nets.correlation.edge_correlation_kernels import round_pixels
+
+        whole, scale, total = x.new_empty(x.shape, dtype=kind), *x.new_empty(2, *x.shape[:2])
+        channels_first = x.permute(2, 0, 1).contiguous().numpy()
+        round_pixels(channels_first, above, whole.view(torch.uint8).numpy(), scale.numpy(), total.numpy())
+        return whole, scale, total
+    scale = x.abs().amax(-1) / 127
+    finite = scale.isfinite()
+    factor = torch.where(finite & (scale > 0), 1 / scale, 0.0)[..., None]
+    levels = torch.where(finite[..., None], (x * factor + 0.5).floor(), 0.0)
+    return (levels + above).to(kind), torch.where(finite, scale, torch.nan), 128 * levels.sum(-1)
+
+
+def fits_bytes(channels: int, radius: int) -> bool:
+    """Tell if there is a kernel for maps of whole numbers, and this CPU has its instructions.
+
+    Args:
+        channels: of the features.
+        radius: of the windows.
+    """
+    if not available():
+        return False
+    from dvo.core.compiled import compiles_int8
+
+    return compiles_int8() and radius == 3 and channels % 32 == 0
 
 
 def fits_bfloat16(channels: int) -> bool:

@@ -6,7 +6,8 @@ would sum each of them across the lanes of a vector on its own, which costs as m
 how a row of eight is taken back.
 
 Maps of bfloat16 are for CPUs that multiply it (AVX-512 BF16): an instruction adds 16 products to eight sums of float32
-(one of twice as many takes twice as long on Zen 4, and has more to sum in the end).
+(one of twice as many takes twice as long on Zen 4, and has more to sum in the end). Maps of bytes are for those that
+multiply these (VNNI): it adds 32 products to eight sums of whole numbers.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ from dvo.core.number_kernels import number, stored
 _WIDTH = 8
 _CHANNELS = 64  # of the features of the default network
 _PAIRED = 16  # products of an instruction for bfloat16
-_VECTOR = ir.VectorType(ir.FloatType(), _WIDTH)
+BYTES = 32
+"""Products of an instruction for bytes, of which the channels are a multiple."""
+_VECTOR, _WHOLE = (ir.VectorType(kind, _WIDTH) for kind in (ir.FloatType(), ir.IntType(32)))
 # Lanes of two vectors, side by side, whose sums are those of pairs of lanes, for each of three foldings.
 _FOLDINGS = (
     ((0, 8, 2, 10, 4, 12, 6, 14), (1, 9, 3, 11, 5, 13, 7, 15)),
@@ -41,6 +44,38 @@ class _BFloat(ir.HalfType):  # llvmlite has none
 
 
 _BFLOATS, _BFLOATS_KEPT = (ir.VectorType(object.__new__(_BFloat), size) for size in (_PAIRED, _WIDTH))
+
+
+def _added(builder: Any, sums: list[Any], added: Any, known: int | None, channels: Any, step: int) -> list[Any]:
+    """Sums after ``added(sums, channel)`` for every channel that is a multiple of a step, in a loop unless it is known
+    how many there are."""
+    index = channels.type
+    if known is not None:
+        for channel in range(0, known, step):
+            sums = added(sums, ir.Constant(index, channel))
+        return sums
+    entry, loop, end = builder.block, builder.append_basic_block(), builder.append_basic_block()
+    builder.branch(loop)
+    builder.position_at_end(loop)
+    channel, before = builder.phi(index), [builder.phi(value.type) for value in sums]
+    after = added(before, channel)
+    following = builder.add(channel, ir.Constant(index, step))
+    builder.cbranch(builder.icmp_signed("<", following, channels), loop, end)
+    begun = [ir.Constant(index, 0), *sums]
+    for value, first, further in zip([channel, *before], begun, [following, *after], strict=True):
+        value.add_incoming(first, entry)
+        value.add_incoming(further, loop)
+    builder.position_at_end(end)
+    return after
+
+
+def _folded(builder: Any, sums: list[Any], add: Any) -> Any:
+    """Vector of the sums across the lanes of eight vectors."""
+    for folding in _FOLDINGS:
+        lanes = [ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), list(order)) for order in folding]
+        pairs = zip(sums[::2], sums[1::2], strict=True)
+        sums = [add(*(builder.shuffle_vector(a, b, order) for order in lanes)) for a, b in pairs]
+    return sums[0]
 
 
 @intrinsic(prefer_literal=True)
@@ -69,13 +104,8 @@ def _eight_products(context, maps, first, feature, channels, out, position):
             unit = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512bf16.dpbf16ps.256")
             return builder.call(unit, [before, a, b])
 
-        def folded(first: Any, second: Any, folding: Any) -> Any:
-            one, other = (ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), list(lanes)) for lanes in folding)
-            one, other = (builder.shuffle_vector(first, second, lanes) for lanes in (one, other))
-            return builder.fadd(one, other)
-
         channels = given[3] if known is None else ir.Constant(given[1].type, known)
-        start, zero = builder.gep(array(0).data, [given[1]]), ir.Constant(given[1].type, 0)
+        start = builder.gep(array(0).data, [given[1]])
         nothing = [ir.Constant(_VECTOR, [0.0] * _WIDTH)] * _WIDTH
 
         def added(sums: Any, channel: Any) -> Any:
@@ -86,29 +116,63 @@ def _eight_products(context, maps, first, feature, channels, out, position):
                 pixel = builder.gep(pixel, [channels])
             return after
 
-        if known is not None:
-            after = nothing
-            for channel in range(0, known, read.count):
-                after = added(after, ir.Constant(zero.type, channel))
-        else:
-            entry, loop, end = builder.block, builder.append_basic_block(), builder.append_basic_block()
-            builder.branch(loop)
-            builder.position_at_end(loop)
-            channel, sums = builder.phi(zero.type), [builder.phi(_VECTOR) for _ in range(_WIDTH)]
-            after = added(sums, channel)
-            following = builder.add(channel, ir.Constant(zero.type, read.count))
-            builder.cbranch(builder.icmp_signed("<", following, channels), loop, end)
-            for value, first, further in zip([channel, *sums], [zero, *nothing], [following, *after], strict=True):
-                value.add_incoming(first, entry)
-                value.add_incoming(further, loop)
-            builder.position_at_end(end)
-        for folding in _FOLDINGS:
-            after = [folded(a, b, folding) for a, b in zip(after[::2], after[1::2], strict=True)]
+        after = _added(builder, nothing, added, known, channels, read.count)
         place = builder.gep(array(4).data, [given[5]])
-        builder.store(after[0], builder.bitcast(place, _VECTOR.as_pointer()), align=4)
+        builder.store(_folded(builder, after, builder.fadd), builder.bitcast(place, _VECTOR.as_pointer()), align=4)
         return target.get_dummy_value()
 
     return types.void(maps, types.intp, feature, types.intp if known is None else channels, out, types.intp), generate
+
+
+@intrinsic(prefer_literal=True)
+def _eight_byte_products(context, maps, first, feature, channels, scales, pixel, factor, total, out, position):
+    """Store at ``position`` of ``out`` the dot products of a feature with eight pixels from ``first`` of flat maps.
+
+    Args:
+        maps: uint8, numbers above 128.
+        feature: int8, ``(C,)``.
+        scales: flat, of the pixels, from ``pixel``.
+        factor: scale of the feature.
+        total: 128 times the sum of the feature.
+    """
+    known = channels.literal_value if isinstance(channels, types.IntegerLiteral) else None
+
+    def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
+        def array(k: int) -> Any:
+            return cgutils.create_struct_proxy(signature.args[k])(target, builder, value=given[k])
+
+        def loaded(pointer: Any) -> Any:
+            return builder.load(builder.bitcast(pointer, _WHOLE.as_pointer()), align=1)
+
+        def everywhere(value: Any) -> Any:
+            kind = ir.VectorType(value.type, _WIDTH)
+            first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+            return builder.shuffle_vector(first, first, ir.Constant(_WHOLE, [0] * _WIDTH))
+
+        kind = ir.FunctionType(_WHOLE, [_WHOLE] * 3)
+        unit = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512.vpdpbusd.256")
+        index = given[1].type
+        channels = given[3] if known is None else ir.Constant(index, known)
+        start, nothing = builder.gep(array(0).data, [given[1]]), [ir.Constant(_WHOLE, [0] * _WIDTH)] * _WIDTH
+
+        def added(sums: Any, channel: Any) -> Any:
+            own, place, after = loaded(builder.gep(array(2).data, [channel])), builder.gep(start, [channel]), []
+            for before in sums:
+                after.append(builder.call(unit, [before, loaded(place), own]))
+                place = builder.gep(place, [channels])
+            return after
+
+        after = _added(builder, nothing, added, known, channels, BYTES)
+        whole = builder.sub(_folded(builder, after, builder.add), everywhere(given[7]))
+        beside = builder.load(builder.bitcast(builder.gep(array(4).data, [given[5]]), _VECTOR.as_pointer()), align=4)
+        found = builder.fmul(builder.sitofp(whole, _VECTOR), builder.fmul(beside, everywhere(given[6])))
+        place = builder.gep(array(8).data, [given[9]])
+        builder.store(found, builder.bitcast(place, _VECTOR.as_pointer()), align=4)
+        return target.get_dummy_value()
+
+    number, at = types.float32, types.intp
+    of_channels = at if known is None else channels
+    return types.void(maps, at, feature, of_channels, scales, at, number, types.int32, out, at), generate
 
 
 @intrinsic
@@ -323,14 +387,37 @@ def _by_frame(frames, count):
 
 
 @part
-def _correlate(maps, features, at, kk, frames, radius, step, out):
-    """Body of both kernels."""
+def _singles(maps, scales, first, width, feature, numbers, out):
+    channels = len(feature)
+    _products(maps, first * channels, width * channels, feature, _WIDTH, out)
+
+
+@part
+def _halves(maps, scales, first, width, feature, numbers, out):
+    channels = len(feature)
+    _products(maps, first * channels, width * channels, feature, _PAIRED, out)
+
+
+@part
+def _bytes(maps, scales, first, width, feature, numbers, out):
+    flat, total, channels = out.reshape(-1), np.int32(numbers[1]), len(feature)
+    for row in range(_WIDTH):
+        at, to = first + row * width, row * _WIDTH
+        if channels == _CHANNELS:
+            _eight_byte_products(maps, at * _CHANNELS, feature, _CHANNELS, scales, at, numbers[0], total, flat, to)  # type: ignore[call-arg]
+        else:
+            _eight_byte_products(maps, at * channels, feature, channels, scales, at, numbers[0], total, flat, to)  # type: ignore[call-arg]
+
+
+@part
+def _correlate(maps, scales, features, numbers, at, kk, frames, radius, products_of, out):
+    """Body of all kernels; see :func:`correlate_bytes` for scales and numbers, which others pass over."""
     taps = 2 * radius + 2
     _, height, width, channels = maps.shape
-    flat, flat_out = maps.reshape(-1), out.reshape(-1)
+    flat, flat_scales, flat_out = maps.reshape(-1), scales.reshape(-1), out.reshape(-1)
     products = np.empty((taps, taps), np.float32)
     flat_products = products.reshape(-1)
-    order, line = _by_frame(frames, len(maps)), 2 * step
+    order, line = _by_frame(frames, len(maps)), 64 // maps.itemsize
     for place, edge in enumerate(order):
         # Windows of the next edge are asked for row by row meanwhile.
         following = order[min(place + 1, len(order) - 1)]
@@ -349,8 +436,8 @@ def _correlate(maps, features, at, kk, frames, radius, step, out):
                         out[edge, pixel, i, j] = stored(np.float32(np.nan), out[edge, pixel, i, j])  # type: ignore[call-arg]
                 continue
             left, top, fx, fy = _corner(x, y, radius, height, width)
-            first = ((frames[edge] * height + top) * width + left) * channels
-            _products(flat, first, width * channels, features[kk[edge], pixel], step, products)
+            first, k = (frames[edge] * height + top) * width + left, kk[edge]
+            products_of(flat, flat_scales, first, width, features[k, pixel], numbers[k, pixel], products)
             if taps == _WIDTH:
                 begin = (edge * at.shape[1] + pixel) * (taps - 1) * (taps - 1)
                 _blend_eight(flat_products, fx, fy, flat_out, begin)  # type: ignore[call-arg]
@@ -361,13 +448,69 @@ def _correlate(maps, features, at, kk, frames, radius, step, out):
 @compiled
 def correlate(maps, features, at, kk, frames, radius, out):
     """Fill ``out (E, q, 2r+1, 2r+1)``; the other arguments are those of the twin; all but positions are contiguous."""
-    _correlate(maps, features, at, kk, frames, radius, _WIDTH, out)
+    _correlate(maps, at, features, features, at, kk, frames, radius, _singles, out)
 
 
 @compiled
 def correlate_bfloat16(maps, features, at, kk, frames, radius, out):
     """:func:`correlate` where maps, features and ``out`` are bits of bfloat16, as uint16, for CPUs that multiply it."""
-    _correlate(maps, features, at, kk, frames, radius, _PAIRED, out)
+    _correlate(maps, at, features, features, at, kk, frames, radius, _halves, out)
+
+
+@compiled
+def correlate_bytes(maps, scales, features, numbers, at, kk, frames, radius, out):
+    """:func:`correlate` of whole numbers with scales, for CPUs that multiply bytes.
+
+    Args:
+        maps: ``(N, H, W, C)`` uint8, numbers above 128; C is a multiple of :data:`BYTES`.
+        scales: ``(N, H, W)`` float32, of the pixels.
+        features: ``(K, q, C)`` int8.
+        numbers: ``(K, q, 2)`` float32: scale, and 128 times the sum of the channels.
+        radius: 3.
+        out: of float32, or bits of bfloat16.
+    """
+    _correlate(maps, scales, features, numbers, at, kk, frames, radius, _bytes, out)
+
+
+@compiled
+def round_pixels(level, above, out, scales, totals):
+    """Round the channels of each pixel to whole numbers of -127 to 127 and a scale.
+
+    Args:
+        level: ``(C, h, w)`` float32.
+        above: what is added to the numbers.
+        out: ``(h, w, C)`` uint8; with nothing added, bits of int8.
+        scales: ``(h, w)``; NaN where a channel is not finite.
+        totals: ``(h, w)``, 128 times the sums of the numbers.
+    """
+    channels, height, width = level.shape
+    values = np.empty((width, channels), np.float32)
+    bits = values.view(np.int32)
+    bound = np.empty(1, np.int32)
+    largest = bound.view(np.float32)
+    for y in range(height):
+        for c in range(channels):
+            for x in range(width):
+                values[x, c] = level[c, y, x]
+        for x in range(width):
+            most = np.int32(0)
+            for c in range(channels):
+                most = max(most, bits[x, c] & np.int32(0x7FFFFFFF))
+            bound[0] = most
+            size = largest[0]
+            if not size < np.float32(np.inf):
+                scales[y, x], totals[y, x] = np.nan, 0
+                for c in range(channels):
+                    out[y, x, c] = np.uint8(above)
+                continue
+            factor = np.float32(127) / size if size > 0 else np.float32(0)
+            scales[y, x] = size / np.float32(127)
+            total = np.int32(0)
+            for c in range(channels):
+                whole = np.int32(values[x, c] * factor + np.float32(127.5)) - np.int32(127)
+                total += whole
+                out[y, x, c] = np.uint8(whole + above)
+            totals[y, x] = np.float32(128) * np.float32(total)
 
 
 @compiled

@@ -34,6 +34,13 @@ _SLICES = 16  # of a row, whose bounds are found side by side
 
 
 @part
+def _copy(x, floor, row):
+    for c in range(len(row)):
+        value = number(x[c])  # type: ignore[call-arg]
+        row[c] = floor if value < floor else value
+
+
+@part
 def _ordered(bits):
     """Whole numbers, in the order of the numbers of float32 that have these bits; and the other way round."""
     return bits ^ ((bits >> np.int32(31)) & np.int32(0x7FFFFFFF))
@@ -56,18 +63,14 @@ def quantise(x: Array, further: Array, rectified: bool, out: Array, scale: Array
     A row is that of ``x (E, A)`` followed by that of ``further (E, B)``, perhaps rectified; four levels are a uint32. A
     row with a number that is not finite gets a scale of NaN.
     """
-    count, more, steps = x.shape[1], further.shape[1], out.shape[1]
-    row, levels = np.empty(count + more, np.float32), np.zeros(4 * steps, np.uint8)
+    count, steps = x.shape[1], out.shape[1]
+    row, levels = np.empty(count + further.shape[1], np.float32), np.zeros(4 * steps, np.uint8)
     bits, bound, fours = row.view(np.int32), np.empty(2, np.int32), levels.view(np.uint32)
     bounds = bound.view(np.float32)
     floor = np.float32(0) if rectified else np.float32(-np.inf)
     for e in range(len(x)):
-        for c in range(count):
-            value = number(x[e, c])  # type: ignore[call-arg]
-            row[c] = floor if value < floor else value
-        for c in range(more):
-            value = number(further[e, c])  # type: ignore[call-arg]
-            row[count + c] = floor if value < floor else value
+        _copy(x[e], floor, row[:count])
+        _copy(further[e], floor, row[count:])
         least, most = _bounds(bits)
         to, r = out[e // ROWS], e % ROWS
         bound[0], bound[1] = _ordered(least), _ordered(most)

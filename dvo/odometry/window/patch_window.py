@@ -22,8 +22,9 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.step import Revision, UpdateState, revise, step
 from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.nets.correlation.correlation import Correlation
-from dvo.nets.correlation.edge_correlation import EdgeCorrelation, fits_bfloat16
+from dvo.nets.correlation.edge_correlation import EdgeCorrelation, fits_bfloat16, fits_bytes, round_channels
 from dvo.nets.patch.patchifier import patch_coordinates, pool_levels
+from dvo.nets.update.int8 import Int8Linear
 from dvo.odometry.frames.front_end import View, keyframe_of
 from dvo.odometry.window.alignment import AlignmentSnapshot, WindowAlignment
 from dvo.odometry.window.pose_validation import PoseSupport, support_of
@@ -116,17 +117,16 @@ class WindowCorrelation:
 
     Attributes:
         features: ``(N, M, p^2, C)`` matching features of the patches by map slot, as the look-up takes them.
+        numbers: ``(N, M, p^2, 2)`` scale and total of features that are whole numbers.
     """
 
     def __init__(self, window: Window, model: PatchVO, device: torch.device) -> None:
         config = model.config
         self.window, self.pyramid = window, config.pyramid
-        half = (
-            model.precision == torch.bfloat16 and multiplies_bfloat16(device) and fits_bfloat16(config.feature_channels)
-        )
-        dtype = torch.bfloat16 if half else torch.float32
+        dtype = _type_of_maps(model, device)
         self.levels = [EdgeCorrelation(scale, config.radius, device, dtype) for scale in config.pyramid]
-        self.features = torch.zeros(0, 0, 0, 0, device=device, dtype=dtype)
+        self.features = torch.zeros(0, 0, 0, 0, device=device, dtype=torch.int8 if dtype == torch.uint8 else dtype)
+        self.numbers = torch.zeros(0, 0, 0, 2, device=device)
 
     @property
     def capacity(self) -> int:
@@ -145,9 +145,15 @@ class WindowCorrelation:
             level.keep_map(slot, pooled[0, 0])
         missing = self.capacity - len(self.features)
         if missing:
-            empty = self.features.new_zeros(missing, *own.shape)
-            self.features = torch.cat([self.features, empty]) if len(self.features) else empty
-        self.features[slot] = own
+            first = not len(self.features)
+            for name, shape in (("features", own.shape), ("numbers", (*own.shape[:2], 2))):
+                empty = (kept := getattr(self, name)).new_zeros(missing, *shape)
+                setattr(self, name, empty if first else torch.cat([kept, empty]))
+        if self.features.dtype == torch.int8:
+            self.features[slot], *numbers = round_channels(own)
+            self.numbers[slot] = torch.stack(numbers, -1)
+        else:
+            self.features[slot] = own
 
     def __call__(self, coords: Tensor, graph: PatchGraph) -> Correlation:
         """Look up the edges of the window, see :class:`dvo.nets.correlation.correlation.CorrelationLookup`.
@@ -160,9 +166,22 @@ class WindowCorrelation:
             Channels in the order ``pixels_first``.
         """
         m, slots = self.window.per_frame, self.window.map_slots
-        features, maps, kk = self.features.flatten(0, 1), slots[graph.jj], slots[graph.ii] * m + graph.kk % m
-        found = [level.lookup(coords[0], features, kk, maps)[None] for level in self.levels]
+        maps, kk = slots[graph.jj], slots[graph.ii] * m + graph.kk % m
+        features = self.features.flatten(0, 1)
+        numbers = self.numbers.flatten(0, 1) if features.dtype == torch.int8 else None
+        found = [level.lookup(coords[0], features, kk, maps, numbers)[None] for level in self.levels]
         return Correlation(found, "pixels_first")
+
+
+def _type_of_maps(model: PatchVO, device: torch.device) -> torch.dtype:
+    """Type in which features are looked up; whole numbers where the update operator has layers of these."""
+    config = model.config
+    if any(isinstance(x, Int8Linear) for x in model.update.modules()) and fits_bytes(
+        config.feature_channels, config.radius
+    ):
+        return torch.uint8
+    half = model.precision == torch.bfloat16 and multiplies_bfloat16(device)
+    return torch.bfloat16 if half and fits_bfloat16(config.feature_channels) else torch.float32
 
 
 class PatchWindow:

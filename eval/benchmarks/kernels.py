@@ -2,7 +2,8 @@
 
 Prints for each kernel a line: size, milliseconds of the kernel and of its PyTorch twin on one thread (medians of
 ``--repeats`` runs that take turns, so that a busy machine slows both), the ratio, and the largest difference of the
-results. The lines of ``bfloat16`` have the network in that precision, and in float32 in the place of the twin.
+results. The lines of ``bfloat16`` and ``int8`` have a part of the network in that precision, and in float32 in place of
+the twin.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from unittest import mock
 
 import torch
@@ -28,7 +30,7 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.schedule import full_graph
 from dvo.nets.alignment.alignment import align_patches
 from dvo.nets.correlation.correlation import Correlation
-from dvo.nets.correlation.edge_correlation import EdgeCorrelation
+from dvo.nets.correlation.edge_correlation import EdgeCorrelation, round_channels
 from dvo.nets.patch.config import preset
 from dvo.nets.patch.encoder import normalise
 from dvo.nets.patch.patchifier import normalise_images
@@ -60,6 +62,9 @@ def edge_correlation(
     patch = torch.stack(torch.meshgrid(ticks, ticks, indexing="xy"), -1)
     coords = torch.rand(edges, 1, 1, 2, generator=generator) * torch.tensor([width, height]) + 1.05 * patch
     given = [x.to(device) for x in (coords, features, kk, slots)]
+    if dtype == torch.uint8:
+        given[1], *numbers = round_channels(given[1])
+        given.append(torch.stack(numbers, -1))
     return f"{edges} edges, {channels} channels", lambda: level.lookup(*given)
 
 
@@ -92,23 +97,23 @@ def scores(generator: torch.Generator, device: torch.device) -> tuple[str, Call]
 
 def update(generator: torch.Generator, device: torch.device) -> tuple[str, Call]:
     """Update operator, of float32 on the CPU."""
-    return of_update(generator, torch.float32)
+    return of_update(generator, "float32")
 
 
-def of_update(generator: torch.Generator, dtype: torch.dtype) -> tuple[str, Call]:
+def of_update(generator: torch.Generator, precision: str) -> tuple[str, Call]:
     """Update operator of the network ``small``, untrained, on the edges of a window, in one precision.
 
     Args:
         generator: of the input, and of the network the generator of torch.
-        dtype: of the network and of the correlation.
+        precision: of the network and of the correlation.
     """
     config, graph = preset("small"), full_graph(frames=9, patches=24, self_edges=False)
     model = PatchVO(config).eval()
-    model = model.in_bfloat16() if dtype == torch.bfloat16 else model
+    model = {"float32": lambda: model, "bfloat16": model.in_bfloat16, "int8": model.in_int8}[precision]()
     state = torch.randn(1, len(graph), config.hidden_channels, generator=generator)
     channels = config.correlation_channels // len(config.pyramid)
     shape = (1, len(graph), channels)
-    levels = [torch.randn(shape, generator=generator).to(dtype) for _ in config.pyramid]
+    levels = [torch.randn(shape, generator=generator).to(model.precision) for _ in config.pyramid]
     correlation = Correlation(levels, order="pixels_first")
     return f"{len(graph)} edges", lambda: model.update(state, state, correlation, graph)[1]
 
@@ -164,7 +169,7 @@ OF_A_CPU: dict[str, Callable[[torch.Generator, torch.device], tuple[str, Call]]]
 
 
 def encoder(generator: torch.Generator) -> tuple[str, Call, Call]:
-    """Encoder of the network ``small``, untrained, in both precisions."""
+    """Encoder of the network ``small``, untrained, in bfloat16 and in float32."""
     image = torch.randint(0, 256, (240, 320, 3), generator=generator, dtype=torch.uint8).permute(2, 0, 1)[None, None]
 
     def call(model: PatchVO) -> Call:
@@ -174,28 +179,29 @@ def encoder(generator: torch.Generator) -> tuple[str, Call, Call]:
     return "320x240", call(model.in_bfloat16()), call(model)
 
 
-def update_operator(generator: torch.Generator) -> tuple[str, Call, Call]:
-    """Update operator in both precisions."""
-    (size, half), (_, single) = (
-        of_update(torch.manual_seed(generator.initial_seed()), dtype) for dtype in (torch.bfloat16, torch.float32)
+def update_operator(generator: torch.Generator, precision: str) -> tuple[str, Call, Call]:
+    """Update operator in a precision and in float32."""
+    (size, lower), (_, single) = (
+        of_update(torch.manual_seed(generator.initial_seed()), name) for name in (precision, "float32")
     )
-    return size, half, single
+    return size, lower, single
 
 
-def correlation(generator: torch.Generator) -> tuple[str, Call, Call]:
-    """Look-up at the finer level in both precisions."""
+def correlation(generator: torch.Generator, dtype: torch.dtype) -> tuple[str, Call, Call]:
+    """Look-up at the finer level in maps of a type and of float32."""
     seed = generator.initial_seed()
-    (size, half), (_, single) = (
-        edge_correlation(torch.Generator().manual_seed(seed), CPU, 1, dtype)
-        for dtype in (torch.bfloat16, torch.float32)
+    (size, lower), (_, single) = (
+        edge_correlation(torch.Generator().manual_seed(seed), CPU, 1, kind) for kind in (dtype, torch.float32)
     )
-    return size, half, single
+    return size, lower, single
 
 
 PRECISIONS = {
     "encoder, bfloat16": encoder,
-    "correlation, bfloat16": correlation,
-    "update, bfloat16": update_operator,
+    "correlation, bfloat16": partial(correlation, dtype=torch.bfloat16),
+    "update, bfloat16": partial(update_operator, precision="bfloat16"),
+    "correlation, int8": partial(correlation, dtype=torch.uint8),
+    "update, int8": partial(update_operator, precision="int8"),
 }
 """By name: a function of a random generator that returns a description of the size, and calls in both precisions."""
 
@@ -254,8 +260,8 @@ def main() -> None:
                 size, call = kernels[name](generator, CPU)
                 kernel, twin, largest = compare(call, options.repeats, CPU)
             else:
-                size, half, single = PRECISIONS[name](generator)
-                kernel, twin, largest = in_turns(half, single, options.repeats, CPU)
+                size, lower, single = PRECISIONS[name](generator)
+                kernel, twin, largest = in_turns(lower, single, options.repeats, CPU)
             print(f"{name:24} {size:28} {1e3 * kernel:8.2f} {1e3 * twin:8.2f} {twin / kernel:6.1f} {largest:11.1e}")
 
 

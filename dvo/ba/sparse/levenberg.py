@@ -115,7 +115,8 @@ def levenberg_marquardt(
             if decrease <= options.tolerance * now:
                 converged = True
                 break
-            system = linearise(state)
+            if tried < options.max_iterations:
+                system = linearise(state)
         else:
             if 0 <= predicted <= options.tolerance * 1e-3 * now:
                 converged = True

@@ -36,8 +36,8 @@ _SLICES = 16  # of a row, whose bounds are found side by side
 @part
 def _copy(x, floor, row):
     for c in range(len(row)):
-        value = number(x[c])  # type: ignore[call-arg]
-        row[c] = floor if value < floor else value
+        row[c] = number(x[c])  # type: ignore[call-arg]
+        row[c] = floor if row[c] < floor else row[c]
 
 
 @part

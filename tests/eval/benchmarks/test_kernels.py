@@ -12,12 +12,16 @@ def test_a_line_of_a_kernel_and_its_twin(capsys, monkeypatch):
     assert line.startswith("correlation, level 4") and 0 <= float(line.split()[-1]) < 1e-3
 
 
-def test_prints_both_precisions_of_the_network(monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["kernels", "--only", "bfloat16", "--repeats", "1"])
+@pytest.mark.parametrize(
+    ("precision", "names", "most"),
+    [("bfloat16", ["encoder", "correlation", "update"], 0.2), ("int8", ["correlation", "update"], 1.0)],
+)
+def test_prints_both_precisions_of_the_network(precision, names, most, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["kernels", "--only", precision, "--repeats", "1"])
     main()
     lines = capsys.readouterr().out.splitlines()[1:]
-    assert [line.split(",")[0] for line in lines] == ["encoder", "correlation", "update"]
-    assert all(0 < float(line.split()[-1]) < 0.2 for line in lines)
+    assert [line.split(",")[0] for line in lines] == names
+    assert all(0 < float(line.split()[-1]) < most for line in lines)
 
 
 @pytest.mark.parametrize("arguments", [["--only", "none"], ["--repeats", "0"]])

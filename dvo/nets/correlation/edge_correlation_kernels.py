@@ -486,7 +486,7 @@ def round_pixels(level, above, out, scales, totals):
     channels, height, width = level.shape
     values = np.empty((width, channels), np.float32)
     bits = values.view(np.int32)
-    bound = np.empty(1, np.int32)
+    bound, shift = np.empty(1, np.int32), np.int32(above - 127)
     largest = bound.view(np.float32)
     for y in range(height):
         for c in range(channels):
@@ -495,7 +495,8 @@ def round_pixels(level, above, out, scales, totals):
         for x in range(width):
             most = np.int32(0)
             for c in range(channels):
-                most = max(most, bits[x, c] & np.int32(0x7FFFFFFF))
+                value = np.int32(bits[x, c] & np.int32(0x7FFFFFFF))
+                most = value if value > most else most
             bound[0] = most
             size = largest[0]
             if not size < np.float32(np.inf):
@@ -507,10 +508,10 @@ def round_pixels(level, above, out, scales, totals):
             scales[y, x] = size / np.float32(127)
             total = np.int32(0)
             for c in range(channels):
-                whole = np.int32(values[x, c] * factor + np.float32(127.5)) - np.int32(127)
+                whole = np.int32(values[x, c] * factor + np.float32(127.5))
                 total += whole
-                out[y, x, c] = np.uint8(whole + above)
-            totals[y, x] = np.float32(128) * np.float32(total)
+                out[y, x, c] = np.uint8(np.int32(whole + shift))
+            totals[y, x] = np.float32(128) * np.float32(total - 127 * channels)
 
 
 @compiled

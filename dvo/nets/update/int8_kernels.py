@@ -43,7 +43,7 @@ def _copy(x, floor, row):
 @part
 def _ordered(bits):
     """Whole numbers, in the order of the numbers of float32 that have these bits; and the other way round."""
-    return bits ^ ((bits >> np.int32(31)) & np.int32(0x7FFFFFFF))
+    return np.int32(bits ^ ((bits >> np.int32(31)) & np.int32(0x7FFFFFFF)))
 
 
 @part
@@ -52,7 +52,8 @@ def _bounds(bits):
     least, most = _ordered(bits[0]), _ordered(bits[0])
     for c in range(len(bits)):
         value = _ordered(bits[c])
-        least, most = min(least, value), max(most, value)
+        least = value if value < least else least
+        most = value if value > most else most
     return least, most
 
 

@@ -138,7 +138,7 @@ class TrackerConfig:
         scale: observation that metres come from, none for a trajectory up to scale; a table of its values will do.
         inertial: use of inertial samples that frames bring, a :class:`dvo.odometry.inertial.options.InertialOptions`; a
             table of its values will do.
-        precision: see :data:`Precision` (:meth:`dvo.models.patch_vo.PatchVO.in_bfloat16`). All else is computed in
+        precision: see :data:`Precision` (``PatchVO.in_bfloat16``, ``PatchVO.in_int8``). All else is computed in
             float32 and float64. ``run.json`` says which one it was.
         sensors: names of others whose measurements take part in every step of an initialised window
             (:data:`dvo.odometry.window.sensors.WINDOW_SENSORS`), with commas between or as a list.

@@ -181,7 +181,7 @@ def round_channels(x: Float[Tensor, "h w C"], *, above: int = 0) -> tuple[Tensor
         return whole, scale, total
     scale = x.abs().amax(-1) / 127
     finite = scale.isfinite()
-    factor = torch.where(finite & (scale > 0), 1 / scale, 0.0)[..., None]
+    factor = torch.where(finite & (scale > 1e-30), 1 / scale, 0.0)[..., None]
     levels = torch.where(finite[..., None], (x * factor + 0.5).floor(), 0.0)
     return (levels + above).to(kind), torch.where(finite, scale, torch.nan), 128 * levels.sum(-1)
 

@@ -504,7 +504,7 @@ def round_pixels(level, above, out, scales, totals):
                 for c in range(channels):
                     out[y, x, c] = np.uint8(above)
                 continue
-            factor = np.float32(127) / size if size > 0 else np.float32(0)
+            factor = np.float32(127) / size if size > np.float32(1e-28) else np.float32(0)
             scales[y, x] = size / np.float32(127)
             total = np.int32(0)
             for c in range(channels):

@@ -56,7 +56,7 @@ def round_rows(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     low = x.amin(-1, keepdim=True)
     size = x.amax(-1, keepdim=True) - low
     whole = size.isfinite()
-    factor = torch.where(size > 0, 255 / size, 0.0)
+    factor = torch.where(size > 1e-30, 255 / size, 0.0)
     levels = torch.where(whole, ((x - low) * factor + 0.5).floor(), 0.0)
     return levels, torch.where(whole, size / 255, torch.nan), torch.where(whole, low, 0.0)
 

@@ -30,7 +30,7 @@ ROWS = 6
 """Inputs likewise: so many sums stay in registers."""
 _SUMS, _FLOATS = ir.VectorType(ir.IntType(32), LANES), ir.VectorType(ir.FloatType(), LANES)
 _HALVES = ir.VectorType(ir.IntType(16), LANES)
-_SLICES = 16  # of a row, whose bounds are found side by side
+_LEAST = np.float32(1e-30)  # distance of the bounds of a row, below which it is taken as one value
 
 
 @part
@@ -80,7 +80,7 @@ def quantise(x: Array, further: Array, rectified: bool, out: Array, scale: Array
             scale[e], offset[e] = np.nan, 0
             to[:, r] = 0
             continue
-        factor = np.float32(255) / size if size > 0 else np.float32(0)
+        factor = np.float32(255) / size if size > _LEAST else np.float32(0)
         scale[e], offset[e] = size / np.float32(255), low
         for c in range(len(row)):
             levels[c] = np.uint8(np.int32((row[c] - low) * factor + np.float32(0.5)))
@@ -152,15 +152,15 @@ def _multiply(context, rows, first, weights, panel, steps, scales, offsets, at, 
             value.add_incoming(further, loop)
         builder.position_at_end(end)
         fast = dict(flags=("contract",))
-        for half in range(_VECTORS):
-            scale, total, bias = (loaded(place(8, given[9], k * COLUMNS + half * LANES), _FLOATS) for k in range(3))
+        for k in range(_VECTORS):
+            scale, total, bias = (loaded(place(8, given[9], n * COLUMNS + k * LANES), _FLOATS) for n in range(3))
             for r in range(ROWS):
                 size = everywhere(builder.load(place(5, given[7], r)), _FLOATS)
                 low = everywhere(builder.load(place(6, given[7], r)), _FLOATS)
-                value = builder.fmul(builder.sitofp(after[r][half], _FLOATS), builder.fmul(size, scale, **fast), **fast)
+                value = builder.fmul(builder.sitofp(after[r][k], _FLOATS), builder.fmul(size, scale, **fast), **fast)
                 value = builder.fadd(value, builder.fadd(builder.fmul(low, total, **fast), bias, **fast), **fast)
                 line = builder.add(given[11], builder.mul(given[12], ir.Constant(index, r)))
-                where = place(10, line, half * LANES)
+                where = place(10, line, k * LANES)
                 builder.store(value if single else rounded(value), builder.bitcast(where, kept.as_pointer()), align=2)
         return target.get_dummy_value()
 

@@ -37,7 +37,7 @@ class EdgeCorrelation:
 
     Attributes:
         maps: ``(N, H, W, C)`` features by map slot, each in a border of ``2 radius + 2`` zeros; others are not defined.
-            Whole numbers are stored above 128.
+            Whole numbers are stored above 128, as ``(N, H, C / 4, W, 4)``.
         scales: ``(N, H, W)`` of the whole numbers, 0 in the border; empty for other types.
 
     Example:
@@ -67,19 +67,22 @@ class EdgeCorrelation:
         have, border = len(self.maps), 2 * self.radius + 2
         if slot >= have:
             first = FIRST_MAPS if level.device.type == "cpu" else FIRST_ON_DEVICE
-            grown = self.maps.new_empty(max(slot + 1, 2 * have, first), h + 2 * border, w + 2 * border, c)
+            height, width, whole = h + 2 * border, w + 2 * border, self.maps.dtype == torch.uint8
+            shape = (height, c // 4, width, 4) if whole else (height, width, c)
+            grown = self.maps.new_empty(max(slot + 1, 2 * have, first), *shape)
             if have:
                 grown[:have] = self.maps
             self.maps = grown
-            if grown.dtype == torch.uint8:
-                more = self.scales.new_zeros(len(grown) - have, *grown.shape[1:3])
+            if whole:
+                more = self.scales.new_zeros(len(grown) - have, height, width)
                 self.scales = torch.cat([self.scales, more]) if have else more
-        inside = slice(border, border + h), slice(border, border + w)
+        rows, columns, of_level = slice(border, border + h), slice(border, border + w), level.permute(1, 2, 0)
         if self.maps.dtype == torch.uint8:
-            self.maps[slot][inside], self.scales[slot][inside], _ = round_channels(level.permute(1, 2, 0), above=128)
+            whole, self.scales[slot, rows, columns], _ = round_channels(of_level, above=128)
+            self.maps[slot, rows, :, columns] = whole.unflatten(2, (-1, 4)).transpose(1, 2)
             return
         self.maps[slot].zero_()
-        self.maps[slot][inside] = level.permute(1, 2, 0)
+        self.maps[slot, rows, columns] = of_level
 
     def lookup(
         self,
@@ -155,7 +158,7 @@ class EdgeCorrelation:
                 frames.numpy(), self.radius, (out.view(torch.uint16) if half else out).numpy(),
             )  # fmt: skip
             return out
-        maps = (self.maps.float() - 128) * self.scales[..., None]
+        maps = (self.maps.transpose(2, 3).flatten(3).float() - 128) * self.scales[..., None]
         found = correlate_edges(maps, features.float() * numbers[..., :1], at, kk, frames, self.radius)
         return found.bfloat16() if half else found
 
@@ -172,13 +175,15 @@ def round_channels(x: Float[Tensor, "h w C"], *, above: int = 0) -> tuple[Tensor
         a channel is not finite; and float32 ``(h, w)`` 128 times the sums of the numbers, without what is added.
     """
     kind = torch.uint8 if above else torch.int8
-    if use_kernels(x):
+    if use_kernels(x) and x.shape[-1] % 4 == 0:
         from dvo.nets.correlation.edge_correlation_kernels import round_pixels
 
-        whole, scale, total = x.new_empty(x.shape, dtype=kind), *x.new_empty(2, *x.shape[:2])
+        height, width, channels = x.shape
+        whole = x.new_empty(height, channels // 4, width, 4, dtype=kind)
+        scale, total = x.new_empty(2, height, width)
         channels_first = x.permute(2, 0, 1).contiguous().numpy()
         round_pixels(channels_first, above, whole.view(torch.uint8).numpy(), scale.numpy(), total.numpy())
-        return whole, scale, total
+        return whole.transpose(1, 2).flatten(2), scale, total
     scale = x.abs().amax(-1) / 127
     finite = scale.isfinite()
     factor = torch.where(finite & (scale > 1e-30), 1 / scale, 0.0)[..., None]
@@ -197,7 +202,7 @@ def fits_bytes(channels: int, radius: int) -> bool:
         return False
     from dvo.core.compiled import compiles_int8
 
-    return compiles_int8() and radius == 3 and channels % 32 == 0
+    return compiles_int8() and radius == 3 and channels % 4 == 0
 
 
 def fits_bfloat16(channels: int) -> bool:

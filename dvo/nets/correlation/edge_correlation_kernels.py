@@ -7,7 +7,8 @@ how a row of eight is taken back.
 
 Maps of bfloat16 are for CPUs that multiply it (AVX-512 BF16): an instruction adds 16 products to eight sums of float32
 (one of twice as many takes twice as long on Zen 4, and has more to sum in the end). Maps of bytes are for those that
-multiply these (VNNI): it adds 32 products to eight sums of whole numbers.
+multiply these (VNNI): it adds four products of a pixel to each of eight sums of whole numbers, which are those of
+eight pixels, and nothing is left to sum.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from dvo.core.number_kernels import number, stored
 _WIDTH = 8
 _CHANNELS = 64  # of the features of the default network
 _PAIRED = 16  # products of an instruction for bfloat16
-BYTES = 32
-"""Products of an instruction for bytes, of which the channels are a multiple."""
+BYTES = 4
+"""Channels that an instruction for bytes multiplies in each of eight pixels."""
 _VECTOR, _WHOLE = (ir.VectorType(kind, _WIDTH) for kind in (ir.FloatType(), ir.IntType(32)))
 # Lanes of two vectors, side by side, whose sums are those of pairs of lanes, for each of three foldings.
 _FOLDINGS = (
@@ -69,110 +70,104 @@ def _added(builder: Any, sums: list[Any], added: Any, known: int | None, channel
     return after
 
 
-def _folded(builder: Any, sums: list[Any], add: Any) -> Any:
-    """Vector of the sums across the lanes of eight vectors."""
-    for folding in _FOLDINGS:
-        lanes = [ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), list(order)) for order in folding]
-        pairs = zip(sums[::2], sums[1::2], strict=True)
-        sums = [add(*(builder.shuffle_vector(a, b, order) for order in lanes)) for a, b in pairs]
-    return sums[0]
-
-
 @intrinsic(prefer_literal=True)
-def _eight_products(context, maps, first, feature, channels, out, position):
-    """Store at ``position`` of ``out`` the dot products of a feature with eight pixels from ``first`` of flat maps.
-
-    All arrays are contiguous and of float32; the channels are a multiple of eight. Or maps and feature are bits of
-    bfloat16, as uint16, and the channels a multiple of 16. If their number is a literal, the addresses of the pixels
-    are constants.
-    """
-    known = channels.literal_value if isinstance(channels, types.IntegerLiteral) else None
-    single = maps.dtype == types.float32
-    read = _VECTOR if single else _BFLOATS
-
-    def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
-        def array(k: int) -> Any:
-            return cgutils.create_struct_proxy(signature.args[k])(target, builder, value=given[k])
-
-        def loaded(pointer: Any) -> Any:
-            return builder.load(builder.bitcast(pointer, read.as_pointer()), align=4 if single else 2)
-
-        def plus(before: Any, a: Any, b: Any) -> Any:
-            if single:
-                return builder.fadd(before, builder.fmul(a, b, flags=("contract",)), flags=("contract",))
-            kind = ir.FunctionType(_VECTOR, [_VECTOR, read, read])
-            unit = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512bf16.dpbf16ps.256")
-            return builder.call(unit, [before, a, b])
-
-        channels = given[3] if known is None else ir.Constant(given[1].type, known)
-        start = builder.gep(array(0).data, [given[1]])
-        nothing = [ir.Constant(_VECTOR, [0.0] * _WIDTH)] * _WIDTH
-
-        def added(sums: Any, channel: Any) -> Any:
-            feature_part = loaded(builder.gep(array(2).data, [channel]))
-            pixel, after = builder.gep(start, [channel]), []
-            for before in sums:
-                after.append(plus(before, feature_part, loaded(pixel)))
-                pixel = builder.gep(pixel, [channels])
-            return after
-
-        after = _added(builder, nothing, added, known, channels, read.count)
-        place = builder.gep(array(4).data, [given[5]])
-        builder.store(_folded(builder, after, builder.fadd), builder.bitcast(place, _VECTOR.as_pointer()), align=4)
-        return target.get_dummy_value()
-
-    return types.void(maps, types.intp, feature, types.intp if known is None else channels, out, types.intp), generate
-
-
-@intrinsic(prefer_literal=True)
-def _eight_byte_products(context, maps, first, feature, channels, scales, pixel, factor, total, out, position):
-    """Store at ``position`` of ``out`` the dot products of a feature with eight pixels from ``first`` of flat maps.
+def _window_products(
+    context, maps, first, line, features, own, channels, scales, pixel, width, factor, total, out
+):  # fmt: skip
+    """Fill flat ``out`` with the dot products of a feature with a window of 8 x 8 pixels of flat maps.
 
     Args:
-        maps: uint8, numbers above 128.
-        feature: int8, ``(C,)``.
-        scales: flat, of the pixels, from ``pixel``.
-        factor: scale of the feature.
-        total: 128 times the sum of the feature.
+        maps: of float32 or bits of bfloat16 (uint16), pixel by pixel. Or uint8, numbers above 128: four channels of a
+            row of pixels, then the next four.
+        first: index at which the window begins; the next row is ``line`` farther.
+        features: flat, of float32, bits of bfloat16, or int8; the feature begins at ``own``. If the number of its
+            channels is a literal, the addresses of pixels are constants.
+        scales: flat, of the pixels, from ``pixel``; rows are ``width`` apart. For whole numbers, as are the next two.
+        factor, total: scale of the feature, and 128 times its sum.
     """
     known = channels.literal_value if isinstance(channels, types.IntegerLiteral) else None
+    kind = {types.float32: _VECTOR, types.uint16: _BFLOATS, types.uint8: _WHOLE}[maps.dtype]
 
     def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
-        def array(k: int) -> Any:
-            return cgutils.create_struct_proxy(signature.args[k])(target, builder, value=given[k])
+        index = given[1].type
 
-        def loaded(pointer: Any) -> Any:
-            return builder.load(builder.bitcast(pointer, _WHOLE.as_pointer()), align=1)
+        def place(k: int, at: Any) -> Any:
+            array = cgutils.create_struct_proxy(signature.args[k])(target, builder, value=given[k])
+            return builder.gep(array.data, [at])
+
+        def loaded(pointer: Any, kind: Any = kind) -> Any:
+            align = getattr(kind, "element", kind) in (ir.FloatType(), ir.IntType(32)) and maps.dtype != types.uint8
+            return builder.load(builder.bitcast(pointer, kind.as_pointer()), align=4 if align else 1)
 
         def everywhere(value: Any) -> Any:
             kind = ir.VectorType(value.type, _WIDTH)
             first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
             return builder.shuffle_vector(first, first, ir.Constant(_WHOLE, [0] * _WIDTH))
 
-        kind = ir.FunctionType(_WHOLE, [_WHOLE] * 3)
-        unit = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512.vpdpbusd.256")
-        index = given[1].type
-        channels = given[3] if known is None else ir.Constant(index, known)
-        start, nothing = builder.gep(array(0).data, [given[1]]), [ir.Constant(_WHOLE, [0] * _WIDTH)] * _WIDTH
+        def plus(before: Any, a: Any, b: Any) -> Any:
+            if kind == _VECTOR:
+                return builder.fadd(before, builder.fmul(a, b, flags=("contract",)), flags=("contract",))
+            name = "avx512.vpdpbusd.256" if kind == _WHOLE else "avx512bf16.dpbf16ps.256"
+            of_unit = ir.FunctionType(before.type, [before.type, kind, kind])
+            unit = cgutils.get_or_insert_function(builder.module, of_unit, f"llvm.x86.{name}")
+            return builder.call(unit, [before, a, b])
 
-        def added(sums: Any, channel: Any) -> Any:
-            own, place, after = loaded(builder.gep(array(2).data, [channel])), builder.gep(start, [channel]), []
-            for before in sums:
-                after.append(builder.call(unit, [before, loaded(place), own]))
-                place = builder.gep(place, [channels])
-            return after
+        def stored(row: Any, value: Any) -> None:
+            to = place(11, builder.mul(row, ir.Constant(index, _WIDTH)))
+            builder.store(value, builder.bitcast(to, _VECTOR.as_pointer()), align=4)
 
-        after = _added(builder, nothing, added, known, channels, BYTES)
-        whole = builder.sub(_folded(builder, after, builder.add), everywhere(given[7]))
-        beside = builder.load(builder.bitcast(builder.gep(array(4).data, [given[5]]), _VECTOR.as_pointer()), align=4)
-        found = builder.fmul(builder.sitofp(whole, _VECTOR), builder.fmul(beside, everywhere(given[6])))
-        place = builder.gep(array(8).data, [given[9]])
-        builder.store(found, builder.bitcast(place, _VECTOR.as_pointer()), align=4)
+        channels = given[5] if known is None else ir.Constant(index, known)
+        start, feature = place(0, given[1]), place(3, given[4])
+
+        def of_pixels(row: Any) -> None:
+            """Eight sums, each of products of one pixel."""
+            begin = builder.gep(start, [builder.mul(row, given[2])])
+
+            def added(sums: Any, channel: Any) -> Any:
+                part, pixel, after = loaded(builder.gep(feature, [channel])), builder.gep(begin, [channel]), []
+                for before in sums:
+                    after.append(plus(before, part, loaded(pixel)))
+                    pixel = builder.gep(pixel, [channels])
+                return after
+
+            nothing = [ir.Constant(_VECTOR, [0.0] * _WIDTH)] * _WIDTH
+            after = _added(builder, nothing, added, known, channels, kind.count)
+            for folding in _FOLDINGS:
+                lanes = [ir.Constant(_WHOLE, list(order)) for order in folding]
+                pairs = zip(after[::2], after[1::2], strict=True)
+                after = [builder.fadd(*(builder.shuffle_vector(a, b, order) for order in lanes)) for a, b in pairs]
+            stored(row, after[0])
+
+        def of_rows() -> None:
+            """Sums of each row, whose lanes are those of its pixels."""
+
+            def added(sums: Any, channel: Any) -> Any:
+                four = everywhere(loaded(builder.gep(feature, [channel]), ir.IntType(32)))
+                pixels, after = builder.gep(start, [builder.mul(channel, given[8])]), []
+                for before in sums:
+                    after.append(plus(before, loaded(pixels), four))
+                    pixels = builder.gep(pixels, [given[2]])
+                return after
+
+            nothing = [ir.Constant(_WHOLE, [0] * _WIDTH)] * _WIDTH
+            total, factor, beside = everywhere(given[10]), everywhere(given[9]), place(6, given[7])
+            for row, value in enumerate(_added(builder, nothing, added, known, channels, BYTES)):
+                whole = builder.sitofp(builder.sub(value, total), _VECTOR)
+                stored(ir.Constant(index, row), builder.fmul(whole, builder.fmul(loaded(beside, _VECTOR), factor)))
+                beside = builder.gep(beside, [given[8]])
+
+        if kind == _WHOLE:
+            of_rows()
+        else:
+            with cgutils.for_range(builder, ir.Constant(index, _WIDTH)) as loop:
+                of_pixels(loop.index)
         return target.get_dummy_value()
 
-    number, at = types.float32, types.intp
+    at, number = types.intp, types.float32
     of_channels = at if known is None else channels
-    return types.void(maps, at, feature, of_channels, scales, at, number, types.int32, out, at), generate
+    return types.void(
+        maps, at, at, features, at, of_channels, scales, at, at, number, types.int32, out
+    ), generate  # fmt: skip
 
 
 @intrinsic
@@ -290,28 +285,15 @@ def _eight_adjoints(context, maps, first, d_maps, feature, d_feature, weights, p
 
 
 @part
-def _products(maps, first, stride, feature, step, out):
-    """Dot products of a feature with a window of pixels, from index ``first`` of flat maps with rows of ``stride``.
-
-    ``step`` is the number of channels that are multiplied at once.
-    """
+def _products(maps, first, stride, feature, out):
+    """Dot products of a feature with a window of pixels, from index ``first`` of flat maps with rows of ``stride``."""
     channels, taps = len(feature), len(out)
-    if channels % step == 0 and taps % _WIDTH == 0:
-        flat = out.reshape(-1)
-        for row in range(taps):
-            for left in range(0, taps, _WIDTH):
-                at = first + row * stride + left * channels
-                if channels == _CHANNELS:
-                    _eight_products(maps, at, feature, _CHANNELS, flat, row * taps + left)  # type: ignore[call-arg]
-                else:
-                    _eight_products(maps, at, feature, channels, flat, row * taps + left)  # type: ignore[call-arg]
-        return
     for row in range(taps):
         for column in range(taps):
-            pixel = maps[first + row * stride + column * channels :]
+            at = first + row * stride + column * channels
             total = np.float32(0)
             for k in range(channels):
-                total += number(feature[k]) * number(pixel[k])  # type: ignore[call-arg]
+                total += number(feature[k]) * number(maps[at + k])  # type: ignore[call-arg]
             out[row, column] = total
 
 
@@ -387,60 +369,54 @@ def _by_frame(frames, count):
 
 
 @part
-def _singles(maps, scales, first, width, feature, numbers, out):
-    channels = len(feature)
-    _products(maps, first * channels, width * channels, feature, _WIDTH, out)
+def _correlate(maps, size, step, scales, features, numbers, at, kk, frames, radius, out):
+    """Body of all kernels; see :func:`correlate_bytes` for scales and numbers, which others pass over.
 
-
-@part
-def _halves(maps, scales, first, width, feature, numbers, out):
-    channels = len(feature)
-    _products(maps, first * channels, width * channels, feature, _PAIRED, out)
-
-
-@part
-def _bytes(maps, scales, first, width, feature, numbers, out):
-    flat, total, channels = out.reshape(-1), np.int32(numbers[1]), len(feature)
-    for row in range(_WIDTH):
-        at, to = first + row * width, row * _WIDTH
-        if channels == _CHANNELS:
-            _eight_byte_products(maps, at * _CHANNELS, feature, _CHANNELS, scales, at, numbers[0], total, flat, to)  # type: ignore[call-arg]
-        else:
-            _eight_byte_products(maps, at * channels, feature, channels, scales, at, numbers[0], total, flat, to)  # type: ignore[call-arg]
-
-
-@part
-def _correlate(maps, scales, features, numbers, at, kk, frames, radius, products_of, out):
-    """Body of all kernels; see :func:`correlate_bytes` for scales and numbers, which others pass over."""
-    taps = 2 * radius + 2
-    _, height, width, channels = maps.shape
+    Nothing is sliced for a window: that would count references, which takes as long as its products.
+    """
+    taps, pixels, channels = 2 * radius + 2, features.shape[1], features.shape[2]
+    height, width = size
     flat, flat_scales, flat_out = maps.reshape(-1), scales.reshape(-1), out.reshape(-1)
+    flat_features, flat_numbers = features.reshape(-1), numbers.reshape(-1)
     products = np.empty((taps, taps), np.float32)
-    flat_products = products.reshape(-1)
-    order, line = _by_frame(frames, len(maps)), 64 // maps.itemsize
+    flat_products, order = products.reshape(-1), _by_frame(frames, len(maps))
+    # Distance of pixels, and of what is asked for ahead in a row.
+    by_pixel, reach, jump = channels, (taps + 2) * channels, 64 // maps.itemsize
+    if maps.ndim == 5:
+        by_pixel, reach, jump = BYTES, width * channels, BYTES * width
     for place, edge in enumerate(order):
         # Windows of the next edge are asked for row by row meanwhile.
         following = order[min(place + 1, len(order) - 1)]
         x, y, ahead = at[following, 0, 0], at[following, 0, 1], -1
         if not (math.isnan(x) or math.isnan(y)):
             left, top, _, _ = _corner(x, y, radius, height, width)
-            ahead = ((frames[following] * height + top) * width + left) * channels
-        for pixel in range(at.shape[1]):
+            ahead = (frames[following] * height + top) * width * channels + left * by_pixel
+        for pixel in range(pixels):
             if ahead >= 0:
-                for near in range(0, (taps + 2) * channels, line):
+                for near in range(0, reach, jump):
                     _fetch(flat, min(ahead + pixel * width * channels + near, flat.size - 1))  # type: ignore[call-arg]
-            x, y = at[edge, pixel, 0], at[edge, pixel, 1]
+            x, y, to = at[edge, pixel, 0], at[edge, pixel, 1], (edge * pixels + pixel) * (taps - 1) * (taps - 1)
             if math.isnan(x) or math.isnan(y):
-                for i in range(taps - 1):
-                    for j in range(taps - 1):
-                        out[edge, pixel, i, j] = stored(np.float32(np.nan), out[edge, pixel, i, j])  # type: ignore[call-arg]
+                for k in range((taps - 1) * (taps - 1)):
+                    flat_out[to + k] = stored(np.float32(np.nan), flat_out[to + k])  # type: ignore[call-arg]
                 continue
             left, top, fx, fy = _corner(x, y, radius, height, width)
-            first, k = (frames[edge] * height + top) * width + left, kk[edge]
-            products_of(flat, flat_scales, first, width, features[k, pixel], numbers[k, pixel], products)
+            line, k = frames[edge] * height + top, kk[edge] * pixels + pixel
+            first, stride, own = line * width * channels + left * by_pixel, width * channels, k * channels
+            if taps != _WIDTH or channels % step:
+                _products(flat, first, stride, features[kk[edge], pixel], products)
+            elif channels == _CHANNELS:
+                _window_products(  # type: ignore[call-arg]
+                    flat, first, stride, flat_features, own, _CHANNELS, flat_scales, line * width + left, width,
+                    flat_numbers[2 * k], np.int32(flat_numbers[2 * k + 1]), flat_products,
+                )  # fmt: skip
+            else:
+                _window_products(  # type: ignore[call-arg]
+                    flat, first, stride, flat_features, own, channels, flat_scales, line * width + left, width,
+                    flat_numbers[2 * k], np.int32(flat_numbers[2 * k + 1]), flat_products,
+                )  # fmt: skip
             if taps == _WIDTH:
-                begin = (edge * at.shape[1] + pixel) * (taps - 1) * (taps - 1)
-                _blend_eight(flat_products, fx, fy, flat_out, begin)  # type: ignore[call-arg]
+                _blend_eight(flat_products, fx, fy, flat_out, to)  # type: ignore[call-arg]
             else:
                 _blend(products, fx, fy, out[edge, pixel])
 
@@ -448,13 +424,15 @@ def _correlate(maps, scales, features, numbers, at, kk, frames, radius, products
 @compiled
 def correlate(maps, features, at, kk, frames, radius, out):
     """Fill ``out (E, q, 2r+1, 2r+1)``; the other arguments are those of the twin; all but positions are contiguous."""
-    _correlate(maps, at, features, features, at, kk, frames, radius, _singles, out)
+    none = np.zeros(2 * features.shape[0] * features.shape[1], np.float32)
+    _correlate(maps, maps.shape[1:3], _WIDTH, none, features, none, at, kk, frames, radius, out)
 
 
 @compiled
 def correlate_bfloat16(maps, features, at, kk, frames, radius, out):
     """:func:`correlate` where maps, features and ``out`` are bits of bfloat16, as uint16, for CPUs that multiply it."""
-    _correlate(maps, at, features, features, at, kk, frames, radius, _halves, out)
+    none = np.zeros(2 * features.shape[0] * features.shape[1], np.float32)
+    _correlate(maps, maps.shape[1:3], _PAIRED, none, features, none, at, kk, frames, radius, out)
 
 
 @compiled
@@ -462,14 +440,15 @@ def correlate_bytes(maps, scales, features, numbers, at, kk, frames, radius, out
     """:func:`correlate` of whole numbers with scales, for CPUs that multiply bytes.
 
     Args:
-        maps: ``(N, H, W, C)`` uint8, numbers above 128; C is a multiple of :data:`BYTES`.
+        maps: ``(N, H, C / 4, W, 4)`` uint8, numbers above 128.
         scales: ``(N, H, W)`` float32, of the pixels.
         features: ``(K, q, C)`` int8.
         numbers: ``(K, q, 2)`` float32: scale, and 128 times the sum of the channels.
         radius: 3.
         out: of float32, or bits of bfloat16.
     """
-    _correlate(maps, scales, features, numbers, at, kk, frames, radius, _bytes, out)
+    size = maps.shape[1], maps.shape[3]
+    _correlate(maps, size, BYTES, scales, features, numbers, at, kk, frames, radius, out)
 
 
 @compiled
@@ -479,14 +458,14 @@ def round_pixels(level, above, out, scales, totals):
     Args:
         level: ``(C, h, w)`` float32.
         above: what is added to the numbers.
-        out: ``(h, w, C)`` uint8; with nothing added, bits of int8.
+        out: ``(h, C / 4, w, 4)`` uint8; with nothing added, bits of int8.
         scales: ``(h, w)``; NaN where a channel is not finite.
         totals: ``(h, w)``, 128 times the sums of the numbers.
     """
     channels, height, width = level.shape
     values = np.empty((width, channels), np.float32)
     bits = values.view(np.int32)
-    bound, shift = np.empty(1, np.int32), np.int32(above - 127)
+    bound, shift, levels = np.empty(1, np.int32), np.int32(above - 127), np.empty(channels, np.uint8)
     largest = bound.view(np.float32)
     for y in range(height):
         for c in range(channels):
@@ -502,7 +481,7 @@ def round_pixels(level, above, out, scales, totals):
             if not size < np.float32(np.inf):
                 scales[y, x], totals[y, x] = np.nan, 0
                 for c in range(channels):
-                    out[y, x, c] = np.uint8(above)
+                    out[y, c // BYTES, x, c % BYTES] = np.uint8(above)
                 continue
             factor = np.float32(127) / size if size > np.float32(1e-28) else np.float32(0)
             scales[y, x] = size / np.float32(127)
@@ -510,7 +489,10 @@ def round_pixels(level, above, out, scales, totals):
             for c in range(channels):
                 whole = np.int32(values[x, c] * factor + np.float32(127.5))
                 total += whole
-                out[y, x, c] = np.uint8(np.int32(whole + shift))
+                levels[c] = np.uint8(np.int32(whole + shift))
+            for c in range(0, channels, BYTES):
+                for k in range(BYTES):
+                    out[y, c // BYTES, x, k] = levels[c + k]
             totals[y, x] = np.float32(128) * np.float32(total - 127 * channels)
 
 

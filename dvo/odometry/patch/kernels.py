@@ -113,10 +113,10 @@ BFLOAT16_KERNELS = {
 
 INT8_KERNELS = {
     "dvo.nets.correlation.edge_correlation_kernels:round_pixels": (
-        "f4[:,:,::1], i8, u1[:,:,::1], f4[:,::1], f4[:,::1]"
+        "f4[:,:,::1], i8, u1[:,:,:,::1], f4[:,::1], f4[:,::1]"
     ),
     "dvo.nets.correlation.edge_correlation_kernels:correlate_bytes": (
-        "u1[:,:,:,::1], f4[:,:,::1], i1[:,:,::1], f4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, f4[:,:,:,::1]"
+        "u1[:,:,:,:,::1], f4[:,:,::1], i1[:,:,::1], f4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, f4[:,:,:,::1]"
     ),
     "dvo.nets.update.int8_kernels:quantise": "f4[:,::1], f4[:,::1], b1, u4[:,:,::1], f4[::1], f4[::1]",
     "dvo.nets.update.int8_kernels:multiply": ("u4[:,:,::1], f4[::1], f4[::1], i1[:,:,:,::1], f4[:,:,::1], f4[:,::1]"),
@@ -124,10 +124,10 @@ INT8_KERNELS = {
 """Those of a CPU that tracks in 8 bits, and of float32 in what is not."""
 INT8_BFLOAT16_KERNELS = {
     "dvo.nets.correlation.edge_correlation_kernels:round_pixels": (
-        "f4[:,:,::1], i8, u1[:,:,::1], f4[:,::1], f4[:,::1]"
+        "f4[:,:,::1], i8, u1[:,:,:,::1], f4[:,::1], f4[:,::1]"
     ),
     "dvo.nets.correlation.edge_correlation_kernels:correlate_bytes": (
-        "u1[:,:,:,::1], f4[:,:,::1], i1[:,:,::1], f4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, u2[:,:,:,::1]"
+        "u1[:,:,:,:,::1], f4[:,:,::1], i1[:,:,::1], f4[:,:,::1], f4[:,:,::1], i8[::1], i8[::1], i8, u2[:,:,:,::1]"
     ),
     "dvo.nets.update.int8_kernels:quantise": "u2[:,::1], u2[:,::1], b1, u4[:,:,::1], f4[::1], f4[::1]",
     "dvo.nets.update.int8_kernels:multiply": ("u4[:,:,::1], f4[::1], f4[::1], i1[:,:,:,::1], f4[:,:,::1], u2[:,::1]"),

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation, fits_bytes, round_channels
 from tests.nets.correlation.test_edge_correlation_bfloat16 import CPU, edges
 
-CHANNELS = [32, 64, 96]
+CHANNELS = [4, 24, 64, 96]
 
 
 def whole(x):
@@ -98,7 +98,7 @@ def test_the_kernel_is_used(monkeypatch):
 
 
 def test_no_kernel_for_another_cpu_nor_for_other_sizes(monkeypatch):
-    assert not fits_bytes(48, 3) and not fits_bytes(64, 2)
+    assert not fits_bytes(42, 3) and not fits_bytes(64, 2)
     monkeypatch.setattr("dvo.core.compiled.compiles_int8", lambda: False)
     monkeypatch.setattr("dvo.nets.correlation.edge_correlation_kernels.correlate_bytes", None)
     assert not fits_bytes(64, 3)

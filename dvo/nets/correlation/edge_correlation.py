@@ -67,13 +67,13 @@ class EdgeCorrelation:
         have, border = len(self.maps), 2 * self.radius + 2
         if slot >= have:
             first = FIRST_MAPS if level.device.type == "cpu" else FIRST_ON_DEVICE
-            height, width, whole = h + 2 * border, w + 2 * border, self.maps.dtype == torch.uint8
-            shape = (height, c // 4, width, 4) if whole else (height, width, c)
+            height, width, of_bytes = h + 2 * border, w + 2 * border, self.maps.dtype == torch.uint8
+            shape = (height, c // 4, width, 4) if of_bytes else (height, width, c)
             grown = self.maps.new_empty(max(slot + 1, 2 * have, first), *shape)
             if have:
                 grown[:have] = self.maps
             self.maps = grown
-            if whole:
+            if of_bytes:
                 more = self.scales.new_zeros(len(grown) - have, height, width)
                 self.scales = torch.cat([self.scales, more]) if have else more
         rows, columns, of_level = slice(border, border + h), slice(border, border + w), level.permute(1, 2, 0)

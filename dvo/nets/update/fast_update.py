@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from dvo.map.edges import Groups, PatchGraph
 from dvo.nets.update import update_kernels as kernels
-from dvo.nets.update.int8 import Int8Linear, Rows, array_of, pack_rows
+from dvo.nets.update.int8 import Array, Int8Linear, Rows, array_of, pack_rows
 
 
 def revise_by_kernels(
@@ -34,19 +34,20 @@ def revise_by_kernels(
     seen = _linear(encoder[2], first, rectified=True)
     kernels.normalise(array_of(seen), *_norm(encoder[3]), True)
     seen = _linear(encoder[5], seen)
-    net = torch.empty_like(seen)
-    kernels.join(array_of(hidden), array_of(context), array_of(seen), *_norm(update.norm), array_of(net))
-    beside, added = seen, array_of(seen)[:0]
+    net = torch.empty_like(first)
+    values = array_of(net)
+    kernels.join(hidden.numpy(), context.numpy(), array_of(seen), *_norm(update.norm), values)
+    found = values[:0]
     for layers, index, has in (
         (update.c1, graph.previous, graph.has_previous), (update.c2, graph.following, graph.has_following)
     ):  # fmt: skip
-        kernels.neighbours(array_of(net), added, index.numpy(), has[:, 0].numpy(), array_of(beside))
-        found = _linear(layers[2], _linear(layers[0], beside), rectified=True)
-        added = array_of(found)
-    net += found
+        beside = torch.empty_like(first)
+        kernels.neighbours(values, found, index.numpy(), has[:, 0].numpy(), array_of(beside))
+        found = array_of(_linear(layers[2], _linear(layers[0], beside), rectified=True))
+    kernels.add(values, found)
     _aggregate(update.agg_kk, net, graph.by_patch)
     _aggregate(update.agg_ij, net, graph.by_pair)
-    kernels.normalise(array_of(net), *_norm(recurrent[0]), False)
+    kernels.normalise(values, *_norm(recurrent[0]), False)
     _gated(recurrent[1], net, recurrent[2])
     _gated(recurrent[3], net, None)
     return net.to(hidden.dtype), update.d(net), update.w(net)
@@ -54,25 +55,19 @@ def revise_by_kernels(
 
 def _aggregate(layer: Any, net: Tensor, groups: Groups) -> None:
     """Add the aggregation of its features to ``net``, in place."""
-    pooled = net.new_empty(len(groups.members), net.shape[1])
-    given = _shared(layer.f, net)
-    kernels.pool(
-        array_of(_linear(layer.f, given)),
-        array_of(_linear(layer.g, given)),
-        groups.members.numpy(),
-        groups.mask[..., 0].numpy(),
-        array_of(pooled),
-    )
+    pooled, given = net.new_empty(len(groups.members), net.shape[1]), _shared(layer.f, net)
+    value, score = (array_of(_linear(x, given)) for x in (layer.f, layer.g))
+    kernels.pool(value, score, groups.members.numpy(), groups.mask[..., 0].numpy(), array_of(pooled))
     kernels.spread(array_of(net), array_of(_linear(layer.h, pooled)), groups.group.numpy())
 
 
 def _gated(layer: Any, net: Tensor, norm: nn.LayerNorm | None) -> None:
     """Apply a gated residual to ``net``, and perhaps a normalisation, in place."""
-    residual, given = layer.res, _shared(layer.gate[0], net)
+    residual, given, values = layer.res, _shared(layer.gate[0], net), array_of(net)
     further = _linear(residual[2], _linear(residual[0], given), rectified=True)
-    empty = array_of(net)[0, :0]
+    empty = values[0, :0]
     weight, bias, eps = (empty, empty, 0.0) if norm is None else _norm(norm)
-    kernels.gate(array_of(net), array_of(_linear(layer.gate[0], given)), array_of(further), weight, bias, eps)
+    kernels.gate(values, array_of(_linear(layer.gate[0], given)), array_of(further), weight, bias, eps)
 
 
 def _norm(layer: nn.LayerNorm) -> tuple[Any, Any, float]:
@@ -84,7 +79,7 @@ def _shared(layer: nn.Linear, x: Tensor) -> Tensor | Rows:
     return pack_rows(x) if isinstance(layer, Int8Linear) else x
 
 
-def _linear(layer: nn.Linear, given: Tensor | Rows, *, rectified: bool = False) -> Tensor:
+def _linear(layer: nn.Linear, given: Tensor | Array | Rows, *, rectified: bool = False) -> Tensor | Array:
     """Apply a layer to numbers, perhaps rectified (in place), or to what :func:`_shared` gives."""
     if isinstance(layer, Int8Linear):
         return layer.multiply(given if isinstance(given, Rows) else pack_rows(given, rectified=rectified))

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -101,16 +102,18 @@ class Rows:
     offset: Array
 
 
-def array_of(x: Tensor) -> Array:
-    """Values of a tensor, or bits of one of bfloat16."""
+def array_of(x: Tensor | Array) -> Array:
+    """Values of a tensor, or bits of one of bfloat16; an array is what it is."""
+    if not isinstance(x, Tensor):
+        return x
     return (x.view(torch.uint16) if x.dtype == torch.bfloat16 else x).numpy()
 
 
-def pack_rows(x: Tensor, further: Tensor | None = None, *, rectified: bool = False) -> Rows:
+def pack_rows(x: Tensor | Array, further: Tensor | None = None, *, rectified: bool = False) -> Rows:
     """Round rows by a kernel; its twin is :func:`round_rows`.
 
     Args:
-        x: ``(E, A)`` float32 or bfloat16.
+        x: ``(E, A)`` float32 or bfloat16, or the bits of this.
         further: ``(E, B)`` what follows in each row.
         rectified: negative numbers are taken as 0.
     """
@@ -119,8 +122,8 @@ def pack_rows(x: Tensor, further: Tensor | None = None, *, rectified: bool = Fal
     given = array_of(x)
     more = given[:, :0] if further is None else array_of(further)
     groups, channels = -(-len(given) // kernels.ROWS), given.shape[1] + more.shape[1]
-    levels = torch.empty(groups, -(-channels // 4), kernels.ROWS, dtype=torch.int32).numpy().view("u4")
-    scale, offset = torch.empty(2, groups * kernels.ROWS).numpy()
+    levels = np.empty((groups, -(-channels // 4), kernels.ROWS), np.uint32)
+    scale, offset = np.empty((2, groups * kernels.ROWS), np.float32)
     kernels.quantise(given, more, rectified, levels, scale, offset)
     return Rows(len(given), levels, scale, offset)
 
@@ -166,11 +169,11 @@ class Int8Linear(nn.Linear):
         if self._takes_kernels(*parts):
             first, *others = (x.flatten(0, -2).contiguous() for x in parts)
             further = torch.cat(others, 1) if len(others) > 1 else others[0] if others else None
-            found = self.multiply(pack_rows(first, further), order, weight)
-            return found.view(*parts[0].shape[:-1], self.out_features)
+            found = torch.from_numpy(self.multiply(pack_rows(first, further), order, weight))
+            return found.view(self.gives).view(*parts[0].shape[:-1], self.out_features)
         return multiply_rounded(torch.cat(list(parts), -1), weight(), self.bias).to(self.gives)
 
-    def multiply(self, rows: Rows, order: str = "", weight: Callable[[], Tensor] | None = None) -> Tensor:
+    def multiply(self, rows: Rows, order: str = "", weight: Callable[[], Tensor] | None = None) -> Array:
         """Apply the layer by a kernel; its twin is :func:`multiply_rounded`.
 
         Args:
@@ -178,14 +181,14 @@ class Int8Linear(nn.Linear):
             order, weight: see :meth:`of_parts`.
 
         Returns:
-            ``(E, D)``.
+            ``(E, D)`` float32, or bits of bfloat16.
         """
         from dvo.nets.update import int8_kernels as kernels
 
         if order not in self._packed:
             self._packed[order] = _pack(self.weight if weight is None else weight(), self.bias, kernels.COLUMNS)
-        out = torch.empty(rows.count, self.out_features, dtype=self.gives)
-        kernels.multiply(rows.levels, rows.scale, rows.offset, *self._packed[order], array_of(out))
+        out = np.empty((rows.count, self.out_features), np.uint16 if self.gives == torch.bfloat16 else np.float32)
+        kernels.multiply(rows.levels, rows.scale, rows.offset, *self._packed[order], out)
         return out
 
     def _takes_kernels(self, *parts: Tensor) -> bool:

@@ -103,6 +103,13 @@ def neighbours(x: Array, added: Array, index: Array, has: Array, out: Array) -> 
 
 
 @compiled
+def add(x: Array, further: Array) -> None:
+    """Add to the rows of ``x``, in place."""
+    for e in range(len(x)):
+        _add(x[e], further[e])
+
+
+@compiled
 def pool(value: Array, score: Array, members: Array, real: Array, out: Array) -> None:
     """Fill ``out (G, D)`` with the sums of the values of each group, weighted by a softmax of their scores.
 

@@ -45,25 +45,25 @@ def revise_by_kernels(
         kernels.neighbours(values, found, index.numpy(), has[:, 0].numpy(), array_of(beside))
         found = array_of(_linear(layers[2], _linear(layers[0], beside), rectified=True))
     kernels.add(values, found)
-    _aggregate(update.agg_kk, net, graph.by_patch)
-    _aggregate(update.agg_ij, net, graph.by_pair)
+    for layer, groups in ((update.agg_kk, graph.by_patch), (update.agg_ij, graph.by_pair)):
+        _aggregate(layer, net, values, groups)
     kernels.normalise(values, *_norm(recurrent[0]), False)
-    _gated(recurrent[1], net, recurrent[2])
-    _gated(recurrent[3], net, None)
+    _gated(recurrent[1], net, values, recurrent[2])
+    _gated(recurrent[3], net, values, None)
     return net.to(hidden.dtype), update.d(net), update.w(net)
 
 
-def _aggregate(layer: Any, net: Tensor, groups: Groups) -> None:
-    """Add the aggregation of its features to ``net``, in place."""
-    pooled, given = net.new_empty(len(groups.members), net.shape[1]), _shared(layer.f, net)
+def _aggregate(layer: Any, net: Tensor, values: Array, groups: Groups) -> None:
+    """Add the aggregation of its features to ``net``, whose values are ``values``."""
+    pooled, given = net.new_empty(len(groups.members), net.shape[1]), _shared(layer.f, net, values)
     value, score = (array_of(_linear(x, given)) for x in (layer.f, layer.g))
     kernels.pool(value, score, groups.members.numpy(), groups.mask[..., 0].numpy(), array_of(pooled))
-    kernels.spread(array_of(net), array_of(_linear(layer.h, pooled)), groups.group.numpy())
+    kernels.spread(values, array_of(_linear(layer.h, pooled)), groups.group.numpy())
 
 
-def _gated(layer: Any, net: Tensor, norm: nn.LayerNorm | None) -> None:
-    """Apply a gated residual to ``net``, and perhaps a normalisation, in place."""
-    residual, given, values = layer.res, _shared(layer.gate[0], net), array_of(net)
+def _gated(layer: Any, net: Tensor, values: Array, norm: nn.LayerNorm | None) -> None:
+    """Apply a gated residual to ``net``, whose values are ``values``, and perhaps a normalisation."""
+    residual, given = layer.res, _shared(layer.gate[0], net, values)
     further = _linear(residual[2], _linear(residual[0], given), rectified=True)
     empty = values[0, :0]
     weight, bias, eps = (empty, empty, 0.0) if norm is None else _norm(norm)
@@ -74,9 +74,9 @@ def _norm(layer: nn.LayerNorm) -> tuple[Any, Any, float]:
     return array_of(layer.weight.detach()), array_of(layer.bias.detach()), layer.eps
 
 
-def _shared(layer: nn.Linear, x: Tensor) -> Tensor | Rows:
-    """What this layer and others like it take: ``x``, rounded once for all of them."""
-    return pack_rows(x) if isinstance(layer, Int8Linear) else x
+def _shared(layer: nn.Linear, x: Tensor, values: Array) -> Tensor | Rows:
+    """What this layer and others like it take: ``x``, or its values rounded once for all of them."""
+    return pack_rows(values) if isinstance(layer, Int8Linear) else x
 
 
 def _linear(layer: nn.Linear, given: Tensor | Array | Rows, *, rectified: bool = False) -> Tensor | Array:

@@ -11,6 +11,7 @@ import llvmlite.binding
 import numba
 from numba.core import config, event, sigutils
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.runtime import rtsys
 
 from dvo.core import ahead
 
@@ -58,7 +59,7 @@ def compiled(function: F) -> F:
     except RuntimeError:  # no place for the cache
         return numba.njit(**_OPTIONS)(function)
     cache = kernel._cache
-    cache.save_overload, load = _tried(cache.save_overload), _tried(cache.load_overload)
+    cache.save_overload, load = _tried(cache.save_overload), _tried(_loading(cache))
 
     def load_or_wait(*arguments: Any) -> Any:
         found = load(*arguments)
@@ -69,6 +70,23 @@ def compiled(function: F) -> F:
 
     cache.load_overload, cache.load_kept = load_or_wait, load
     return kernel
+
+
+def _loading(cache: Any) -> Callable[..., Any]:
+    """Function that loads from a cache of numba without the declarations of all that it can compile.
+
+    These take a third of a second, once in a process, and code that is compiled needs none of them.
+    """
+    if not hasattr(cache, "_load_overload"):  # a numba that does it in another way
+        whole: Callable[..., Any] = cache.load_overload
+        return whole
+
+    def load(signature: Any, context: Any) -> Any:
+        rtsys.initialize(context)  # memory of arrays
+        with cache._guard_against_spurious_io_errors():
+            return cache._load_overload(signature, context)
+
+    return load
 
 
 def load_kept(kernel: Any, types: str) -> None:

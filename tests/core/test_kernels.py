@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -145,3 +146,29 @@ def test_functions_of_other_programs_are_compiled_without_a_line():
 def test_importing_dvo_does_not_import_numba():
     script = "import sys, dvo, dvo.cli; assert 'numba' not in sys.modules"
     subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True)
+
+
+@pytest.mark.long
+def test_a_kernel_on_the_disk_is_loaded_without_all_that_numba_can_compile(tmp_path):
+    """And another one can be compiled afterwards."""
+    program = """
+import sys
+import numpy as np
+from dvo.core.compiled import load_kept
+from dvo.nets.update.update_kernels import add, spread
+load_kept(add, "f4[:,::1], f4[:,::1]")
+known = len(add.overloads)
+x = np.ones((3, 4), np.float32)
+add(x, x)
+loaded = "numba.np.linalg" in sys.modules
+spread(x, x, np.zeros(3, np.int64))
+print(known, loaded, float(x.sum()))
+"""
+    found = []
+    for _ in range(2):
+        run = subprocess.run(
+            [sys.executable, "-c", program], check=True, capture_output=True, text=True,
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+        )  # fmt: skip
+        found.append(run.stdout.split())
+    assert found == [["0", "True", "64.0"], ["1", "False", "64.0"]]

@@ -137,15 +137,28 @@ INT8_BFLOAT16_KERNELS = {
 """Those of one that multiplies bfloat16 too."""
 
 
+_INSTEAD = {
+    "dvo.nets.patch.encoder_kernels:normalise": {"dvo.nets.patch.encoder_kernels:normalise_bfloat16"},
+    "dvo.nets.correlation.edge_correlation_kernels:correlate": {
+        "dvo.nets.correlation.edge_correlation_kernels:correlate_bfloat16",
+        "dvo.nets.correlation.edge_correlation_kernels:correlate_bytes",
+    },
+    "dvo.nets.correlation.edge_correlation_kernels:correlate_bfloat16": {
+        "dvo.nets.correlation.edge_correlation_kernels:correlate_bytes"
+    },
+}  # kernels that are not needed where one of some others is
+
+
 def needed() -> dict[str, str]:
     """Kernels of this machine, see :data:`KERNELS`."""
     from dvo.core.compiled import compiles_bfloat16, prefers_int8
 
-    half, bytes_too = compiles_bfloat16(), prefers_int8()
-    first = (BFLOAT16_KERNELS if half else {}) | (
-        (INT8_BFLOAT16_KERNELS if half else INT8_KERNELS) if bytes_too else {}
-    )
-    return first | {name: types for name, types in KERNELS.items() if name not in first}
+    half, found = compiles_bfloat16(), KERNELS
+    if half:
+        found = BFLOAT16_KERNELS | {name: types for name, types in found.items() if name not in BFLOAT16_KERNELS}
+    if prefers_int8():
+        found = (INT8_BFLOAT16_KERNELS if half else INT8_KERNELS) | found
+    return {name: types for name, types in found.items() if not _INSTEAD.get(name, set()) & found.keys()}
 
 
 @cache

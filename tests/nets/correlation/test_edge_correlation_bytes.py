@@ -5,6 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dvo.core.context import multiplies_bfloat16
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation, fits_bytes, round_channels
 from tests.nets.correlation.test_edge_correlation_bfloat16 import CPU, edges
 
@@ -32,16 +33,20 @@ def filled(channels, dtype, height=12, width=17, frames=3):
 @given(
     channels=st.sampled_from(CHANNELS), side=st.sampled_from([1, 3]),
     spread=st.sampled_from([0.3, 1.0, 2.2, 9.0, 40.0]), seed=st.integers(0, 99), known=st.booleans(),
+    half=st.booleans(),
 )  # fmt: skip
 @settings(deadline=None)
-def test_channels_are_the_products_of_the_whole_numbers(kernels, channels, side, spread, seed, known):
+def test_channels_are_the_products_of_the_whole_numbers(kernels, channels, side, spread, seed, known, half):
     coords, features, kk, frames = edges(channels, side, spread, seed)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DVO_KERNELS", kernels)
+        if not half:
+            patch.setattr("dvo.nets.correlation.edge_correlation.multiplies_bfloat16", lambda device: False)
         levels, *numbers = round_channels(features)
         given = (levels, kk, frames, torch.stack(numbers, -1)) if known else (features, kk, frames)
         found = filled(channels, torch.uint8).lookup(coords, *given)
         expected = filled(channels, torch.float32).lookup(coords, whole(features), kk, frames)
+    assert found.dtype == (torch.bfloat16 if half and multiplies_bfloat16(CPU) else torch.float32)
     half = found.dtype == torch.bfloat16
     torch.testing.assert_close(found.float(), expected, rtol=2**-8 if half else 1e-4, atol=1e-3, equal_nan=True)
     assert found.isnan().any() and (found == 0).any()

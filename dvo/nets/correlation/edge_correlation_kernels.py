@@ -2,7 +2,7 @@
 
 Nearly all of its time goes into dot products of a patch feature with the pixels of a row of a window. The compiler
 would sum each of them across the lanes of a vector on its own, which costs as much as the products;
-:func:`_eight_products` states in vector instructions how eight of them are summed at once, and :func:`_eight_adjoints`
+:func:`_window_products` states in vector instructions how eight of them are summed at once, and :func:`_eight_adjoints`
 how a row of eight is taken back.
 
 Maps of bfloat16 are for CPUs that multiply it (AVX-512 BF16): an instruction adds 16 products to eight sums of float32
@@ -96,8 +96,8 @@ def _window_products(
             return builder.gep(array.data, [at])
 
         def loaded(pointer: Any, kind: Any = kind) -> Any:
-            align = getattr(kind, "element", kind) in (ir.FloatType(), ir.IntType(32)) and maps.dtype != types.uint8
-            return builder.load(builder.bitcast(pointer, kind.as_pointer()), align=4 if align else 1)
+            align = 4 if maps.dtype == types.float32 else 1
+            return builder.load(builder.bitcast(pointer, kind.as_pointer()), align=align)
 
         def everywhere(value: Any) -> Any:
             kind = ir.VectorType(value.type, _WIDTH)

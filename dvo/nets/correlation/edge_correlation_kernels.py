@@ -405,7 +405,7 @@ def _correlate(maps, size, step, scales, features, numbers, at, kk, frames, radi
             first, stride, own = line * width * channels + left * by_pixel, width * channels, k * channels
             if taps != _WIDTH or channels % step:
                 _products(flat, first, stride, features[kk[edge], pixel], products)
-            elif channels == _CHANNELS:
+            elif channels == _CHANNELS and maps.ndim == 4:
                 _window_products(  # type: ignore[call-arg]
                     flat, first, stride, flat_features, own, _CHANNELS, flat_scales, line * width + left, width,
                     flat_numbers[2 * k], np.int32(flat_numbers[2 * k + 1]), flat_products,

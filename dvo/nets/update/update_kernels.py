@@ -95,11 +95,9 @@ def neighbours(x: Array, added: Array, index: Array, has: Array, out: Array) -> 
     """Add ``added`` to ``x``, if there is any, and fill ``out`` with its rows at ``index``, or 0 without ``has``."""
     for e in range(len(added)):
         _add(x[e], added[e])
-    for e in range(len(x)):
-        if has[e]:
-            out[e] = x[index[e]]
-        else:
-            out[e] = 0
+    for e in range(len(x)):  # numba takes two seconds to compile an assignment of rows
+        for c in range(x.shape[1]):
+            out[e, c] = x[index[e], c] if has[e] else out.dtype.type(0)
 
 
 @compiled

@@ -157,7 +157,8 @@ def needed() -> dict[str, str]:
     if half:
         found = BFLOAT16_KERNELS | {name: types for name, types in found.items() if name not in BFLOAT16_KERNELS}
     if prefers_int8():
-        found = (INT8_BFLOAT16_KERNELS if half else INT8_KERNELS) | found
+        first = dict(list(found.items())[:1]) if half else {}  # of the encoder
+        found = first | (INT8_BFLOAT16_KERNELS if half else INT8_KERNELS) | found
     return {name: types for name, types in found.items() if not _INSTEAD.get(name, set()) & found.keys()}
 
 

@@ -149,16 +149,20 @@ _INSTEAD = {
 }  # kernels that are not needed where one of some others is
 
 
+_LONGEST = "dvo.ba.layer.edgewise_kernels:take_steps"
+
+
 def needed() -> dict[str, str]:
-    """Kernels of this machine, see :data:`KERNELS`."""
+    """Kernels of this machine, see :data:`KERNELS`; the one that takes longest to compile is the first."""
     from dvo.core.compiled import compiles_bfloat16, prefers_int8
 
     half, found = compiles_bfloat16(), KERNELS
     if half:
         found = BFLOAT16_KERNELS | {name: types for name, types in found.items() if name not in BFLOAT16_KERNELS}
     if prefers_int8():
-        first = dict(list(found.items())[:1]) if half else {}  # of the encoder
-        found = first | (INT8_BFLOAT16_KERNELS if half else INT8_KERNELS) | found
+        found = (INT8_BFLOAT16_KERNELS if half else INT8_KERNELS) | found
+    # Another process compiles the longest one while this one compiles what comes before it.
+    found = {_LONGEST: found[_LONGEST]} | found
     return {name: types for name, types in found.items() if not _INSTEAD.get(name, set()) & found.keys()}
 
 

@@ -162,7 +162,7 @@ def needed() -> dict[str, str]:
     if prefers_int8():
         found = (INT8_BFLOAT16_KERNELS if half else INT8_KERNELS) | found
     # Another process compiles the longest one while this one compiles what comes before it.
-    found = {_LONGEST: found[_LONGEST]} | found
+    found = dict(sorted(found.items(), key=lambda kernel: kernel[0] != _LONGEST))
     return {name: types for name, types in found.items() if not _INSTEAD.get(name, set()) & found.keys()}
 
 

@@ -9,6 +9,7 @@ from dvo.core.compiled import compiles_bfloat16
 from dvo.core.context import multiplies_bfloat16
 from dvo.core.kernels import available
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation
+from tests.support.looked_up_edges import edges
 
 CPU = torch.device("cpu")
 
@@ -19,18 +20,6 @@ def filled(channels, radius, dtype, height=12, width=17, frames=3):
     for slot in range(frames):
         level.keep_map(slot, torch.randn(channels, height, width, generator=generator).bfloat16().float())
     return level
-
-
-def edges(channels, side, spread, seed, count=40):
-    generator = torch.Generator().manual_seed(seed)
-    ticks = spread * (torch.arange(side) - side // 2)
-    patch = torch.stack(torch.meshgrid(ticks, ticks, indexing="xy"), -1)
-    coords = torch.rand(count, 1, 1, 2, generator=generator) * torch.tensor([60.0, 50.0]) - 12 + patch
-    coords[3, 0, 0, 1] = torch.nan
-    coords[5, ..., 0] = 1e6
-    features = torch.randn(7, side**2, channels, generator=generator).bfloat16().float()
-    kk, frames = (torch.randint(most, (count,), generator=generator) for most in (7, 3))
-    return coords, features, kk, frames
 
 
 @pytest.mark.parametrize("kernels", ["numba", "torch"])

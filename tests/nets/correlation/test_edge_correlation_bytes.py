@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 from dvo.core.context import multiplies_bfloat16
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation, fits_bytes, round_channels
-from tests.nets.correlation.test_edge_correlation_bfloat16 import CPU, edges
+from tests.support.looked_up_edges import edges
 
+CPU = torch.device("cpu")
 CHANNELS = [4, 24, 64, 96]
 
 

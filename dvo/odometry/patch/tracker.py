@@ -581,9 +581,9 @@ class PatchOdometry:
 def _precision(wanted: Precision, model: PatchVO, device: torch.device) -> Precision:
     """Precision that the network tracks in: the wanted one, or the fastest on the device."""
     gated = isinstance(model.update, Update)
-    if wanted == "int8" and not gated:
+    if wanted == "int8" and not (gated and device.type == "cpu"):
         remedy = "use auto, float32 or bfloat16"
-        raise DvoError("only the gated update operator multiplies in 8 bits", field="precision", remedy=remedy)
+        raise DvoError("only the gated update operator on a CPU multiplies in 8 bits", field="precision", remedy=remedy)
     if wanted != "auto":
         return wanted
     if gated and multiplies_int8(device):

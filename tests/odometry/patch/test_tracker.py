@@ -14,6 +14,7 @@ from dvo.geometry.camera import Camera
 from dvo.metrics import evaluate
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.initialisation import NOT_INITIALISED
+from dvo.odometry.patch.tracker import _precision
 from dvo.odometry.protocol import Odometry, Status
 from dvo.synth.sequence import make_sequence
 from tests.support.tiny_tracker import SMALL, frames, plain, run, tracker
@@ -69,6 +70,9 @@ def test_precision_is_that_of_the_setting_or_of_the_processor(monkeypatch):
         assert results[0].trajectory.poses_wc.tobytes() == results[1].trajectory.poses_wc.tobytes()
     with pytest.raises(DvoError, match="precision.*gated"):
         tracker(replace(SMALL, precision="int8"), operator="mamba")
+    with pytest.raises(DvoError, match="precision.*CPU"):
+        _precision("int8", tracker(SMALL).model, torch.device("cuda"))
+    assert _precision("auto", tracker(SMALL).model, torch.device("cpu")) == "int8"
 
 
 @pytest.mark.slow

@@ -196,7 +196,7 @@ def correlation(generator: torch.Generator, dtype: torch.dtype) -> tuple[str, Ca
     return size, lower, single
 
 
-PRECISIONS = {
+PRECISIONS: dict[str, Callable[[torch.Generator], tuple[str, Call, Call]]] = {
     "encoder, bfloat16": encoder,
     "correlation, bfloat16": partial(correlation, dtype=torch.bfloat16),
     "update, bfloat16": partial(update_operator, precision="bfloat16"),

@@ -25,13 +25,13 @@ def normalise(
     """Normalise the output of a convolution; add a skip, and rectify the sum.
 
     Args:
-        x: is overwritten where a kernel computes, which takes channels that are last in memory.
+        x: is overwritten where a kernel computes, which takes channels that are last in memory, a multiple of eight.
         norm: :class:`torch.nn.InstanceNorm2d` without parameters, or the identity.
         rectified: with a rectifier behind the normalisation.
         skip: of the same shape; None: none.
     """
     given = (x,) if skip is None else (x, skip)
-    if isinstance(norm, nn.InstanceNorm2d) and use_kernels(*given, half=True) and all(map(_has_channels_last, given)):
+    if isinstance(norm, nn.InstanceNorm2d) and use_kernels(*given, half=True) and all(map(_suits_kernels, given)):
         from dvo.nets.patch import encoder_kernels
 
         half = x.dtype == torch.bfloat16
@@ -45,8 +45,8 @@ def normalise(
     return x if skip is None else F.relu(skip + x)
 
 
-def _has_channels_last(x: Tensor) -> bool:
-    return x.is_contiguous(memory_format=torch.channels_last)
+def _suits_kernels(x: Tensor) -> bool:
+    return x.shape[1] % 8 == 0 and x.is_contiguous(memory_format=torch.channels_last)
 
 
 class ResidualBlock(nn.Module):

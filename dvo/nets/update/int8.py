@@ -121,9 +121,11 @@ def pack_rows(x: Tensor | Array, further: Tensor | None = None, *, rectified: bo
 
     given = array_of(x)
     more = given[:, :0] if further is None else array_of(further)
-    groups, channels = -(-len(given) // kernels.ROWS), given.shape[1] + more.shape[1]
-    levels = np.empty((groups, -(-channels // 4), kernels.ROWS), np.uint32)
-    scale, offset = np.empty((2, groups * kernels.ROWS), np.float32)
+    count, channels = (
+        -(-size // step) * step
+        for size, step in ((len(given), kernels.ROWS), (given.shape[1] + more.shape[1], kernels.LANES))
+    )
+    levels, (scale, offset) = np.empty((count, channels), np.uint8), np.empty((2, count), np.float32)
     kernels.quantise(given, more, rectified, levels, scale, offset)
     return Rows(len(given), levels, scale, offset)
 

@@ -18,6 +18,7 @@ from numba.extending import intrinsic
 
 from dvo.core.compiled import compiled, part
 from dvo.core.number_kernels import number
+from dvo.core.vectors import CONTRACT, Vectors
 
 Array = Any
 
@@ -28,8 +29,6 @@ COLUMNS = _VECTORS * LANES
 """Outputs that are computed at once."""
 ROWS = 6
 """Inputs likewise: so many sums stay in registers."""
-_SUMS, _FLOATS = ir.VectorType(ir.IntType(32), LANES), ir.VectorType(ir.FloatType(), LANES)
-_HALVES = ir.VectorType(ir.IntType(16), LANES)
 _LEAST = np.float32(1e-30)  # distance of the bounds of a row, below which it is taken as one value
 
 
@@ -40,133 +39,136 @@ def _copy(x, floor, row):
         row[c] = floor if row[c] < floor else row[c]
 
 
-@part
-def _ordered(bits):
-    """Whole numbers, in the order of the numbers of float32 that have these bits; and the other way round."""
-    return np.int32(bits ^ ((bits >> np.int32(31)) & np.int32(0x7FFFFFFF)))
+@intrinsic
+def _fill_bounds(context, row, steps, out):
+    """Fill ``out (2,)`` with the least and the largest number of some vectors; NaN is beyond the infinite numbers."""
+
+    def generate(*generating: Any) -> Any:
+        vectors, (_, count, _) = Vectors(LANES, *generating), generating[3]
+        builder = vectors.builder
+
+        def in_order(bits: Any) -> Any:
+            """Whole numbers, in the order of the numbers of float32 that have these bits; and the other way round."""
+            sign, rest = (ir.Constant(bits.type, k) for k in (31, 0x7FFFFFFF))
+            if bits.type == vectors.whole:
+                sign, rest = vectors.constant(31), vectors.constant(0x7FFFFFFF)
+            return builder.xor(bits, builder.and_(builder.ashr(bits, sign), rest))
+
+        def loaded(step: Any) -> Any:
+            place = vectors.place(0, builder.mul(step, ir.Constant(step.type, LANES)))
+            return in_order(builder.bitcast(vectors.load(place), vectors.whole))
+
+        def bounded(step: Any, bounds: list[Any]) -> list[Any]:
+            pairs, value = zip(("<", ">"), bounds, strict=True), loaded(step)
+            return [builder.select(builder.icmp_signed(order, value, bound), value, bound) for order, bound in pairs]
+
+        first = loaded(ir.Constant(count.type, 0))
+        for k, (name, bound) in enumerate(zip(("smin", "smax"), vectors.repeat(count, [first] * 2, bounded), strict=True)):
+            kind = ir.FunctionType(ir.IntType(32), [vectors.whole])
+            least = cgutils.get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.{name}.v{LANES}i32")
+            bits = in_order(builder.call(least, [bound]))
+            builder.store(builder.bitcast(bits, ir.FloatType()), vectors.place(2, k))
+        return vectors.target.get_dummy_value()
+
+    return types.void(row, types.intp, out), generate
 
 
-@part
-def _bounds(bits):
-    """Least and largest of a row of float32 by their bits, by :func:`_ordered`; NaN is beyond the infinite numbers."""
-    least, most = _ordered(bits[0]), _ordered(bits[0])
-    for c in range(len(bits)):
-        value = _ordered(bits[c])
-        least = value if value < least else least
-        most = value if value > most else most
-    return least, most
+@intrinsic
+def _fill_levels(context, row, steps, low, factor, out, to):
+    """Fill flat ``out`` from ``to`` with ``round((row - low) * factor)``, of 0 to 255, of some vectors."""
+
+    def generate(*generating: Any) -> Any:
+        vectors, (_, count, low, factor, _, to) = Vectors(LANES, *generating), generating[3]
+        builder, half = vectors.builder, vectors.constant(0.5)
+        low, factor = vectors.everywhere(low), vectors.everywhere(factor)
+
+        def rounded(step: Any, nothing: list[Any]) -> list[Any]:
+            at = builder.mul(step, ir.Constant(step.type, LANES))
+            scaled = builder.fmul(builder.fsub(vectors.load(vectors.place(0, at)), low), factor, **CONTRACT)
+            level = builder.fptosi(builder.fadd(scaled, half, **CONTRACT), vectors.whole)
+            vectors.store(level, vectors.place(4, to, at))
+            return nothing
+
+        vectors.repeat(count, [], rounded)
+        return vectors.target.get_dummy_value()
+
+    return types.void(row, types.intp, types.float32, types.float32, out, types.intp), generate
 
 
 @compiled
 def quantise(x: Array, further: Array, rectified: bool, out: Array, scale: Array, offset: Array) -> None:
-    """Fill ``out (E / ROWS, C / 4, ROWS)`` with ``round((x - offset) / scale)``, of 0 to 255 for the bounds of a row.
+    """Fill ``out (E, C)`` with ``round((x - offset) / scale)``, of 0 to 255 for the bounds of a row.
 
-    A row is that of ``x (E, A)`` followed by that of ``further (E, B)``, perhaps rectified; four levels are a uint32. A
-    row with a number that is not finite gets a scale of NaN.
+    A row is that of ``x (E, A)`` followed by that of ``further (E, B)``, perhaps rectified, and by anything up to C, a
+    multiple of :data:`LANES`. A row with a number that is not finite gets a scale of NaN.
     """
-    count, steps = x.shape[1], out.shape[1]
-    row, levels = np.empty(count + further.shape[1], np.float32), np.zeros(4 * steps, np.uint8)
-    bits, bound, fours = row.view(np.int32), np.empty(2, np.int32), levels.view(np.uint32)
-    bounds = bound.view(np.float32)
+    count, size = x.shape[1], out.shape[1]
+    channels, steps = count + further.shape[1], size // LANES
+    row, bounds, flat = np.empty(size, np.float32), np.empty(2, np.float32), out.reshape(-1)
     floor = np.float32(0) if rectified else np.float32(-np.inf)
     for e in range(len(x)):
         _copy(x[e], floor, row[:count])
-        _copy(further[e], floor, row[count:])
-        least, most = _bounds(bits)
-        to, r = out[e // ROWS], e % ROWS
-        bound[0], bound[1] = _ordered(least), _ordered(most)
-        low, size = bounds[0], bounds[1] - bounds[0]
-        if not size < np.float32(np.inf):
+        _copy(further[e], floor, row[count:channels])
+        row[channels:] = row[0]
+        _fill_bounds(row, steps, bounds)  # type: ignore[call-arg]
+        low, height = bounds[0], bounds[1] - bounds[0]
+        if not height < np.float32(np.inf):
             scale[e], offset[e] = np.nan, 0
-            to[:, r] = 0
+            out[e] = 0
             continue
-        factor = np.float32(255) / size if size > _LEAST else np.float32(0)
-        scale[e], offset[e] = size / np.float32(255), low
-        for c in range(len(row)):
-            levels[c] = np.uint8(np.int32((row[c] - low) * factor + np.float32(0.5)))
-        for c in range(steps):
-            to[c, r] = fours[c]
+        factor = np.float32(255) / height if height > _LEAST else np.float32(0)
+        scale[e], offset[e] = height / np.float32(255), low
+        _fill_levels(row, steps, low, factor, flat, e * size)  # type: ignore[call-arg]
 
 
 @intrinsic
-def _multiply(context, rows, first, weights, panel, steps, scales, offsets, at, layer, column, out, to, stride):
+def _multiply(context, rows, first, size, weights, panel, steps, scales, offsets, at, layer, column, out, to, stride):
     """Products of some rows of bytes with a panel of weights, scaled, into flat ``out`` from ``to``.
 
     Args:
-        rows: flat uint8; those of a product begin at ``first``.
+        rows: flat uint8; those of a product begin at ``first``, and are ``size`` apart.
         weights: flat int8; the panel begins at ``panel`` and has ``steps`` times four bytes of each column.
         scales, offsets: of the rows, from ``at``.
         layer: flat float32: scale, sum and bias of the columns from ``column``, 3 x COLUMNS.
         out: flat, of float32 or bits of bfloat16; rows are ``stride`` apart.
     """
-    single = out.dtype == types.float32
-    kept = _FLOATS if single else _HALVES
 
-    def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
-        index = given[1].type
-
-        def place(k: int, *steps: Any) -> Any:
-            pointer = cgutils.create_struct_proxy(signature.args[k])(target, builder, value=given[k]).data
-            for step in steps:
-                pointer = builder.gep(pointer, [ir.Constant(index, step) if isinstance(step, int) else step])
-            return pointer
-
-        def loaded(pointer: Any, kind: Any) -> Any:
-            return builder.load(builder.bitcast(pointer, kind.as_pointer()), align=1)
-
-        def everywhere(value: Any, kind: Any) -> Any:
-            undefined, lanes = ir.Constant(kind, ir.Undefined), ir.VectorType(ir.IntType(32), LANES)
-            first = builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
-            return builder.shuffle_vector(first, undefined, ir.Constant(lanes, [0] * LANES))
-
-        def rounded(value: Any) -> Any:
-            """Bits of bfloat16, ties to even."""
-            bits = builder.bitcast(value, _SUMS)
-            size, half, one = (ir.Constant(_SUMS, [k] * LANES) for k in (16, 0x7FFF, 1))
-            odd = builder.and_(builder.lshr(bits, size), one)
-            return builder.trunc(builder.lshr(builder.add(builder.add(bits, half), odd), size), _HALVES)
-
+    def generate(*generating: Any) -> Any:
+        vectors, given = Vectors(LANES, *generating), generating[3]
+        builder, index, kind = vectors.builder, vectors.index, vectors.whole
         unit = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(_SUMS, [_SUMS] * 3), f"llvm.x86.avx512.vpdpbusd.{32 * LANES}"
+            builder.module, ir.FunctionType(kind, [kind] * 3), f"llvm.x86.avx512.vpdpbusd.{32 * LANES}"
         )
-        entry, loop, end = builder.block, builder.append_basic_block(), builder.append_basic_block()
-        inputs, start = place(0, given[1]), place(2, given[3])
-        builder.branch(loop)
-        builder.position_at_end(loop)
-        step = builder.phi(index)
-        sums = [[builder.phi(_SUMS) for _ in range(_VECTORS)] for _ in range(ROWS)]
-        inputs = builder.gep(inputs, [builder.mul(step, ir.Constant(index, 4 * ROWS))])
-        start = builder.gep(start, [builder.mul(step, ir.Constant(index, 4 * COLUMNS))])
-        columns = [loaded(builder.gep(start, [ir.Constant(index, 4 * LANES * k)]), _SUMS) for k in range(_VECTORS)]
-        after = []
-        for r, before in enumerate(sums):
-            four = loaded(builder.gep(inputs, [ir.Constant(index, 4 * r)]), ir.IntType(32))
-            own = everywhere(four, _SUMS)
-            both = zip(before, columns, strict=True)
-            after.append([builder.call(unit, [total, own, weight]) for total, weight in both])
-        following = builder.add(step, ir.Constant(index, 1))
-        builder.cbranch(builder.icmp_signed("<", following, given[4]), loop, end)
-        nothing = ir.Constant(_SUMS, [0] * LANES)
-        for value, further in zip(sum(sums, [step]), sum(after, [following]), strict=True):
-            value.add_incoming(ir.Constant(index, 0) if value is step else nothing, entry)
-            value.add_incoming(further, loop)
-        builder.position_at_end(end)
-        fast = dict(flags=("contract",))
+        start = vectors.place(3, given[4])
+        inputs = [vectors.place(0, given[1], builder.mul(given[2], ir.Constant(index, r))) for r in range(ROWS)]
+
+        def added(step: Any, before: list[Any]) -> list[Any]:
+            four = builder.mul(step, ir.Constant(index, 4))
+            panel = vectors.after(start, builder.mul(step, ir.Constant(index, 4 * COLUMNS)))
+            columns = [vectors.raw(vectors.after(panel, 4 * LANES * k), kind) for k in range(_VECTORS)]
+            after = []
+            for r, row in enumerate(inputs):
+                own = vectors.everywhere(vectors.raw(vectors.after(row, four), ir.IntType(32)))
+                both = zip(before[r * _VECTORS :], columns, strict=False)
+                after.extend(builder.call(unit, [total, own, weight]) for total, weight in both)
+            return after
+
+        sums = vectors.repeat(given[5], [vectors.constant(0)] * (ROWS * _VECTORS), added)
         for k in range(_VECTORS):
-            scale, total, bias = (loaded(place(8, given[9], n * COLUMNS + k * LANES), _FLOATS) for n in range(3))
+            places = (vectors.place(9, given[10], n * COLUMNS + k * LANES) for n in range(3))
+            scale, total, bias = (vectors.load(place) for place in places)
             for r in range(ROWS):
-                size = everywhere(builder.load(place(5, given[7], r)), _FLOATS)
-                low = everywhere(builder.load(place(6, given[7], r)), _FLOATS)
-                value = builder.fmul(builder.sitofp(after[r][k], _FLOATS), builder.fmul(size, scale, **fast), **fast)
-                value = builder.fadd(value, builder.fadd(builder.fmul(low, total, **fast), bias, **fast), **fast)
-                line = builder.add(given[11], builder.mul(given[12], ir.Constant(index, r)))
-                where = place(10, line, k * LANES)
-                builder.store(value if single else rounded(value), builder.bitcast(where, kept.as_pointer()), align=2)
-        return target.get_dummy_value()
+                size, low = (vectors.everywhere(builder.load(vectors.place(n, given[8], r))) for n in (6, 7))
+                value = builder.sitofp(sums[r * _VECTORS + k], vectors.floats)
+                value = builder.fmul(value, builder.fmul(size, scale, **CONTRACT), **CONTRACT)
+                rest = builder.fadd(builder.fmul(low, total, **CONTRACT), bias, **CONTRACT)
+                line = builder.add(given[12], builder.mul(given[13], ir.Constant(index, r)))
+                vectors.store(builder.fadd(value, rest, **CONTRACT), vectors.place(11, line, k * LANES))
+        return vectors.target.get_dummy_value()
 
     flat = types.intp
     return types.void(
-        rows, flat, weights, flat, flat, scales, offsets, flat, layer, flat, out, flat, flat
+        rows, flat, flat, weights, flat, flat, scales, offsets, flat, layer, flat, out, flat, flat
     ), generate  # fmt: skip
 
 
@@ -175,13 +177,13 @@ def multiply(rows: Array, scale: Array, offset: Array, weights: Array, layer: Ar
     """Fill ``out (E, D)`` with a linear layer of rows of bytes.
 
     Args:
-        rows, scale, offset: ``(F / ROWS, C / 4, ROWS)``, ``(F,)``, ``(F,)`` of :func:`quantise`; F is E or more.
+        rows, scale, offset: ``(F, C)`` uint8, ``(F,)``, ``(F,)`` of :func:`quantise`; F is E up to a multiple of ROWS.
         weights: ``(D / COLUMNS, C / 4, COLUMNS, 4)`` int8.
         layer: ``(D / COLUMNS, 3, COLUMNS)`` float32: scale of the weights, sum of the weights, bias.
         out: of float32, or bits of bfloat16.
     """
     panels, steps = weights.shape[:2]
-    levels, numbers, outputs = rows.reshape(-1).view(np.uint8), weights.reshape(-1), out.shape[1]
+    levels, numbers, outputs, size = rows.reshape(-1), weights.reshape(-1), out.shape[1], rows.shape[1]
     flat, of_layer = out.reshape(-1), layer.reshape(-1)
     spare = np.empty(ROWS * COLUMNS, out.dtype)
     for e in range(0, len(out), ROWS):
@@ -189,7 +191,7 @@ def multiply(rows: Array, scale: Array, offset: Array, weights: Array, layer: Ar
             inside = e + ROWS <= len(out) and (p + 1) * COLUMNS <= outputs
             to, at, stride = (flat, e * outputs + p * COLUMNS, outputs) if inside else (spare, 0, COLUMNS)
             _multiply(  # type: ignore[call-arg]
-                levels, 4 * e * steps, numbers, 4 * p * steps * COLUMNS, steps, scale, offset, e,
+                levels, e * size, size, numbers, 4 * p * steps * COLUMNS, steps, scale, offset, e,
                 of_layer, 3 * p * COLUMNS, to, at, stride,
             )  # fmt: skip
             if not inside:

@@ -18,9 +18,8 @@ with_kernels = pytest.mark.skipif(not int8.has_kernels(), reason="no instruction
 
 def unpacked(rows: Rows, channels: int):
     """Levels, scale and offset of a kernel in the shapes of the twin."""
-    levels = torch.from_numpy(rows.levels.view("u1").reshape(*rows.levels.shape, 4)).permute(0, 2, 1, 3).flatten(2)
-    scale, offset = (torch.from_numpy(x)[: rows.count, None] for x in (rows.scale, rows.offset))
-    return levels.flatten(0, 1)[: rows.count, :channels].float(), scale, offset
+    levels, scale, offset = (torch.from_numpy(x)[: rows.count] for x in (rows.levels, rows.scale, rows.offset))
+    return levels[:, :channels].float(), scale[:, None], offset[:, None]
 
 
 def random_rows(seed: int, *shape: int) -> torch.Tensor:

@@ -292,9 +292,8 @@ class Window:
         """
         self._edges = None
         kept = mask.nonzero()[:, 0]  # once: an accelerator is waited for until their number is known
-        self.kk, self.jj = self.kk[kept], self.jj[kept]
-        self.hidden, self.targets, self.weights = self.hidden[kept], self.targets[kept], self.weights[kept]
-        self.confidence = self.confidence[kept]
+        for name in ("kk", "jj", "hidden", "targets", "weights", "confidence"):
+            setattr(self, name, getattr(self, name).index_select(0, kept))
 
     def touching(self, position: int) -> Tensor:
         """Select the edges of a frame.

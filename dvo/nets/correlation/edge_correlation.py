@@ -78,8 +78,8 @@ class EdgeCorrelation:
                 self.scales = torch.cat([self.scales, more]) if have else more
         rows, columns, of_level = slice(border, border + h), slice(border, border + w), level.permute(1, 2, 0)
         if self.maps.dtype == torch.uint8:
-            whole, self.scales[slot, rows, columns], _ = round_channels(of_level, above=128)
-            self.maps[slot, rows, :, columns] = whole.unflatten(2, (-1, 4)).transpose(1, 2)
+            fours, self.scales[slot, rows, columns], _ = _round_fours(of_level, above=128)
+            self.maps[slot, rows, :, columns] = fours
             return
         self.maps[slot].zero_()
         self.maps[slot, rows, columns] = of_level
@@ -174,21 +174,30 @@ def round_channels(x: Float[Tensor, "h w C"], *, above: int = 0) -> tuple[Tensor
         The numbers ``(h, w, C)``, uint8 if something is added and int8 otherwise; float32 ``(h, w)`` scales, NaN where
         a channel is not finite; and float32 ``(h, w)`` 128 times the sums of the numbers, without what is added.
     """
-    kind = torch.uint8 if above else torch.int8
     if use_kernels(x) and x.shape[-1] % 4 == 0:
-        from dvo.nets.correlation.edge_correlation_kernels import round_pixels
-
-        height, width, channels = x.shape
-        whole = x.new_empty(height, channels // 4, width, 4, dtype=kind)
-        scale, total = x.new_empty(2, height, width)
-        channels_first = x.permute(2, 0, 1).contiguous().numpy()
-        round_pixels(channels_first, above, whole.view(torch.uint8).numpy(), scale.numpy(), total.numpy())
-        return whole.transpose(1, 2).flatten(2), scale, total
+        fours, scale, total = _round_fours(x, above)
+        return fours.transpose(1, 2).flatten(2), scale, total
     scale = x.abs().amax(-1) / 127
     finite = scale.isfinite()
     factor = torch.where(finite & (scale > 1e-30), 1 / scale, 0.0)[..., None]
     levels = torch.where(finite[..., None], (x * factor + 0.5).floor(), 0.0)
+    kind = torch.uint8 if above else torch.int8
     return (levels + above).to(kind), torch.where(finite, scale, torch.nan), 128 * levels.sum(-1)
+
+
+def _round_fours(x: Tensor, above: int) -> tuple[Tensor, Tensor, Tensor]:
+    """:func:`round_channels` with the numbers as maps have them, ``(h, C / 4, w, 4)``."""
+    if not use_kernels(x):
+        whole, scale, total = round_channels(x, above=above)
+        return whole.unflatten(2, (-1, 4)).transpose(1, 2), scale, total
+    from dvo.nets.correlation.edge_correlation_kernels import round_pixels
+
+    height, width, channels = x.shape
+    fours = x.new_empty(height, channels // 4, width, 4, dtype=torch.uint8 if above else torch.int8)
+    scale, total = x.new_empty(2, height, width)
+    channels_first = x.permute(2, 0, 1).contiguous().numpy()
+    round_pixels(channels_first, above, fours.view(torch.uint8).numpy(), scale.numpy(), total.numpy())
+    return fours, scale, total
 
 
 def fits_bytes(channels: int, radius: int) -> bool:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -124,6 +123,8 @@ class FixedPixels:
         texture = self._slope > TEXTURE
         still = np.sqrt(variance) < DISPLACEMENT * self._slope + NOISE
         fixed = texture & still & (self._across > EXPECTED)
+        if not fixed.any():
+            return None
         whole = cv2.morphologyEx(fixed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
         share = int(whole.sum()) / max(int(texture.sum()), 1)
         if not FIXED_SHARES[0] < share < FIXED_SHARES[1]:
@@ -216,15 +217,10 @@ def picture_motion(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
     affine, agree = cv2.estimateAffine2D(before, after, ransacReprojThreshold=1.0)
     if affine is None or int(agree.sum()) < MIN_CORNERS:
         return None
-    y, x = _grid(height, width)
-    to_right, down = (2 * (row[0] * x + row[1] * y + row[2]) for row in affine.astype(np.float32))
-    return to_right - 2 * x, down - 2 * y
-
-
-@lru_cache(maxsize=1)
-def _grid(height: int, width: int) -> np.ndarray:
-    """``(2, height, width)`` rows and columns of the pixels in an image of half the size."""
-    return np.mgrid[0:height, 0:width].astype(np.float32) / 2
+    y, x = (np.arange(size, dtype=np.float32) for size in (height, width))
+    moved = (affine - np.eye(2, 3)).astype(np.float32)  # of an image of half the size: its shift counts twice
+    to_right, down = (by_x * x + (by_y * y + 2 * shift)[:, None] for by_x, by_y, shift in moved)
+    return to_right, down
 
 
 def _grey_and_gradient(image: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:

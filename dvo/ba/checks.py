@@ -145,7 +145,10 @@ def check_within(tensor: Tensor, field: str, low: float = -LARGEST, high: float 
     Raises:
         DvoError: a number that does not, or NaN.
     """
+    if not tensor.numel():
+        return
+    ends = torch.stack(tensor.aminmax())  # NaN if any number is
     # A limit may be infinite in half precision.
-    if tensor.numel() and not bool((torch.isfinite(tensor) & (tensor >= low) & (tensor <= high)).all()):
+    if not bool((torch.isfinite(ends) & (ends >= low) & (ends <= high)).all()):
         limits = f"from {low:g} to {high:g}"
         raise DvoError(f"a number that is not {limits}", field=field, remedy=f"give finite numbers {limits}")

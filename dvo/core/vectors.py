@@ -15,8 +15,8 @@ CONTRACT = {"flags": ("contract",)}
 class Vectors:
     """Code of vectors for the body of an intrinsic of numba.
 
-    Its arrays are flat, of float32, of bits of bfloat16 as uint16, or of bytes; an array is named by its place among
-    the arguments.
+    Its arrays are flat, of float32 or float64, of bits of bfloat16 as uint16, or of bytes; an array is named by its
+    place among the arguments.
 
     Args:
         lanes: numbers in a vector.
@@ -44,9 +44,9 @@ class Vectors:
         return self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()), align=align)
 
     def load(self, pointer: Any) -> Any:
-        """Numbers of float32 at a pointer into an array of float32 or bfloat16."""
-        if pointer.type.pointee == ir.FloatType():
-            return self.raw(pointer, self.floats, 4)
+        """Numbers at a pointer into an array, of float32 for one of bfloat16."""
+        if pointer.type.pointee != ir.IntType(16):
+            return self.raw(pointer, ir.VectorType(pointer.type.pointee, self.lanes), 4)
         bits = self.builder.zext(self.raw(pointer, self._narrow(16), 2), self.whole)
         return self.builder.bitcast(self.builder.shl(bits, self.constant(16)), self.floats)
 
@@ -60,7 +60,7 @@ class Vectors:
             odd = builder.and_(builder.lshr(bits, self.constant(16)), self.constant(1))
             rounded = builder.add(builder.add(bits, self.constant(0x7FFF)), odd)
             value = builder.trunc(builder.lshr(rounded, self.constant(16)), self._narrow(16))
-        align = 4 if element == ir.FloatType() else 1
+        align = 1 if isinstance(element, ir.IntType) else 4
         builder.store(value, builder.bitcast(pointer, value.type.as_pointer()), align=align)
 
     def constant(self, number: float) -> Any:

@@ -11,16 +11,7 @@ from dvo.geometry.bounds import MIN_Z_VALID
 
 NONE, HUBER, CAUCHY = 0, 1, 2
 """Names of robust kernels as numbers."""
-
-
-@part
-def _rho(s, name, width):
-    square = width * width
-    if name == HUBER:
-        return s if s <= square else 2 * width * math.sqrt(s) - square
-    if name == CAUCHY:
-        return square * math.log1p(s / square)
-    return s
+_MOST = 1e150  # product of which the logarithm is taken
 
 
 @part
@@ -57,6 +48,7 @@ def cost(
     groups, size = filled.shape
     r, move = np.empty((3, 3), rotation.dtype), np.empty(3, rotation.dtype)
     limit, total = max_residual * max_residual, 0.0
+    square, product, logarithms = width * width, 1.0, 0.0  # of Cauchy's kernel: one logarithm for many edges
     for g in range(groups):
         pair = group_pair[g]
         fx, fy = focal[pair_j[pair], 0], focal[pair_j[pair], 1]
@@ -75,7 +67,16 @@ def cost(
                 u, v = (target[e, 0] - x) * fx, (target[e, 1] - y) * fy
                 if u * u + v * v < limit:
                     s = wx * u * u + wy * v * v
-            total += _rho(s, name, width)
+            if name == CAUCHY:
+                product *= 1 + s / square
+                if product > _MOST:
+                    logarithms, product = logarithms + math.log(product), 1.0
+            elif name == HUBER and s > square:
+                total += 2 * width * math.sqrt(s) - square
+            else:
+                total += s
+    if name == CAUCHY:
+        total = square * (logarithms + math.log(product))
     return 0.5 * total
 
 

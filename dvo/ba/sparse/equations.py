@@ -182,7 +182,7 @@ class SparseSystem:
         """
         pattern, dim = self.pattern, self.h_pl.shape[-1]
         blocks = self.h_pl.new_zeros(pattern.reduced.count, dim, dim)
-        blocks[torch.searchsorted(pattern.reduced.keys, poses.pattern.keys)] = poses.blocks
+        blocks.index_copy_(0, pattern.in_reduced, poses.blocks)
         if self._compiled(q):
             from dvo.ba.sparse import schur_kernels
 

@@ -32,7 +32,7 @@ from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, State, StateBlock, check_further
 from dvo.ba.sparse.block_parts import PART, BlockParts
 from dvo.ba.sparse.equations import SparseSystem
-from dvo.ba.sparse.global_edges import ReprojectionEdges
+from dvo.ba.sparse.global_edges import Places, ReprojectionEdges
 from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
 from dvo.ba.sparse.schur_pattern import SchurPattern, make_schur_pattern
 from dvo.ba.sparse.small_problem import SmallProblem, is_small
@@ -222,16 +222,16 @@ class SparseProblem:
         else:
             self.pattern, self.at = self._layout(self.edges, source)
 
-    def _layout(self, edges: ReprojectionEdges, source: Tensor) -> tuple[SchurPattern, tuple[Tensor, Tensor]]:
-        """Pattern, and the observations of the edges in it; without other factors made once for the same edges."""
+    def _layout(self, edges: ReprojectionEdges, source: Tensor) -> tuple[SchurPattern, Places]:
+        """Pattern, and the places of the edges in it; without other factors made once for the same edges."""
         key, known = (self.parts.count, edges.slot.cpu().numpy().tobytes()), edges.plan.layouts
         if self.factors or key not in known:
             pattern = self._pattern(source)
-            target, anchor = (pattern.find(end, edges.plan.kk) for end in edges.ends)
+            places = edges.places(pattern)
             if self.factors:
-                return pattern, (target, anchor)
-            known[key] = pattern, (target, anchor)
-        layout: tuple[SchurPattern, tuple[Tensor, Tensor]] = known[key]
+                return pattern, places
+            known[key] = pattern, places
+        layout: tuple[SchurPattern, Places] = known[key]
         return layout
 
     def _pattern(self, source: Tensor) -> SchurPattern:

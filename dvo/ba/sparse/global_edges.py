@@ -25,6 +25,21 @@ _LAYOUT = "group_pair", "pair_i", "pair_j", "order", "filled", "kk"  # of a plan
 
 
 @dataclass(frozen=True)
+class Places:
+    """Where the sums of edges go in a pattern.
+
+    Attributes:
+        target, source: ``(G * M,)`` observation of each edge by the frame it leads to, and by that of its patch; one
+            past the last for fixed frames.
+        pair: ``(P,)`` block of each pair of frames; not defined with a fixed one.
+    """
+
+    target: Tensor
+    source: Tensor
+    pair: Tensor
+
+
+@dataclass(frozen=True)
 class ReprojectionEdges:
     """Measurements of a graph in the order of an edge plan (one graph, no batch).
 
@@ -140,8 +155,18 @@ class ReprojectionEdges:
         filled = self.plan.filled.flatten()
         return torch.where(filled, target, self.free), torch.where(filled, source, self.free)
 
+    def places(self, pattern: SchurPattern) -> Places:
+        """Where :meth:`accumulate` adds.
+
+        Args:
+            pattern: holds every observation and pair of the edges.
+        """
+        target, source = (pattern.find(end, self.plan.kk) for end in self.ends)
+        frames = self.slot[self.plan.pair_j], self.slot[self.plan.pair_i]
+        return Places(target, source, pattern.h_pp.find(torch.maximum(*frames), torch.minimum(*frames)))
+
     def accumulate(
-        self, poses_cw: Tensor, inverse_depth: Tensor, pattern: SchurPattern, at: tuple[Tensor, Tensor]
+        self, poses_cw: Tensor, inverse_depth: Tensor, pattern: SchurPattern, at: Places
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Linearise and sum over the edges.
 
@@ -149,8 +174,7 @@ class ReprojectionEdges:
             poses_cw: ``(N, 7)``.
             inverse_depth: ``(K,)``.
             pattern: holds every observation and pair of the edges.
-            at: observation of each place ``(G * M,)`` by its target and by its source frame, one past the last for
-                fixed frames.
+            at: of the pattern, see :meth:`places`.
 
         Returns:
             ``h_pp (N_blocks, 6, 6)``, ``h_pl (O, 6)``, ``h_ll (K,)``, ``g_p (n, 6)``, ``g_l (K,)``; see
@@ -182,8 +206,8 @@ class ReprojectionEdges:
             products = (f[:, 0::2] * wd[:, :1] + f[:, 1::2] * wd[:, 1:]).mT  # (G, M, 8)
             by_depth.index_add_(0, plan.kk[places], products[..., 6:].reshape(-1, 2))
             target = products[..., :6]
-            h_pl.index_add_(0, at[0][places], target.reshape(-1, 6))
-            h_pl.index_add_(0, at[1][places], (target @ minus_adjoint.index_select(0, group)).reshape(-1, 6))
+            h_pl.index_add_(0, at.target[places], target.reshape(-1, 6))
+            h_pl.index_add_(0, at.source[places], (target @ minus_adjoint.index_select(0, group)).reshape(-1, 6))
 
         hessian, gradient = by_pair.split((6, 1), -1)
         ji = hessian @ minus_adjoint
@@ -202,20 +226,18 @@ class ReprojectionEdges:
         return h_pp, h_pl[:-1], by_depth[:, 1], g_p, by_depth[:, 0]
 
     def _accumulate_compiled(
-        self, poses_cw: Tensor, inverse_depth: Tensor, pattern: SchurPattern, at: tuple[Tensor, Tensor]
+        self, poses_cw: Tensor, inverse_depth: Tensor, pattern: SchurPattern, at: Places
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         from dvo.ba.sparse import edge_kernels
 
         n, zeros = self.free, poses_cw.new_zeros
         h_pp, h_pl = zeros(pattern.h_pp.count, 6, 6), zeros(len(pattern.keys) + 1, 6)
         h_ll, g_p, g_l = zeros(self.plan.patches), zeros(n + 1, 6), zeros(self.plan.patches)
-        ends = self.slot[self.plan.pair_j], self.slot[self.plan.pair_i]
-        block = pattern.h_pp.find(torch.maximum(*ends), torch.minimum(*ends))  # not looked at for fixed frames
         edge_kernels.accumulate(
             **self._motion(poses_cw, inverse_depth), **self._arrays, **self._robust(),
             max_residual=float(self.max_residual), slot=self.slot.numpy(),
-            at_target=at[0].numpy(), at_source=at[1].numpy(), diagonal=pattern.h_pp.diagonal.numpy(),
-            off_diagonal=block.numpy(), h_pp=h_pp.numpy(), h_pl=h_pl.numpy(), h_ll=h_ll.numpy(), g_p=g_p.numpy(),
+            at_target=at.target.numpy(), at_source=at.source.numpy(), diagonal=pattern.h_pp.diagonal.numpy(),
+            off_diagonal=at.pair.numpy(), h_pp=h_pp.numpy(), h_pl=h_pl.numpy(), h_ll=h_ll.numpy(), g_p=g_p.numpy(),
             g_l=g_l.numpy(),
         )  # fmt: skip
         return h_pp, h_pl[:-1], h_ll, g_p[:n], g_l

@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import llvmlite.binding
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from dvo.core.compiled import compiled
+from dvo.core.vectors import CONTRACT, Vectors
+
+_LANES = 8 if llvmlite.binding.get_host_cpu_features().get("avx512f") else 4
+_VECTORS = 2
+_COLUMNS = _VECTORS * _LANES  # that are multiplied with six at once: their sums stay in registers
 
 
 @compiled
@@ -98,6 +108,41 @@ def coupled(keys, source, free, sources, others):
     return out
 
 
+@intrinsic
+def _add_up(context, w, patches, stride, own, column, out, to):
+    """Fill six rows of flat ``out``, from ``to``, with sums over patches of products of some columns of ``w``.
+
+    Args:
+        w: flat; rows of the patches are ``stride`` apart, as are those of ``out``.
+        patches: one or more.
+        own: first of six columns, one for each row of ``out``.
+        column: first of those that these are multiplied with.
+    """
+
+    def generate(*generating: Any) -> Any:
+        vectors, (_, count, step, six, others, _, begin) = Vectors(_LANES, *generating), generating[3]
+        builder, index = vectors.builder, vectors.index
+        nothing = ir.Constant(ir.VectorType(vectors.place(0).type.pointee, _LANES), [0.0] * _LANES)
+
+        def added(patch: Any, before: list[Any]) -> list[Any]:
+            row, after = vectors.place(0, builder.mul(patch, step)), []
+            columns = [vectors.load(vectors.after(row, others, _LANES * k)) for k in range(_VECTORS)]
+            for i in range(6):
+                factor = vectors.everywhere(builder.load(vectors.after(row, six, i)))
+                for k, value in enumerate(columns):
+                    product = builder.fmul(factor, value, **CONTRACT)
+                    after.append(builder.fadd(before[i * _VECTORS + k], product, **CONTRACT))
+            return after
+
+        for k, total in enumerate(vectors.repeat(count, [nothing] * (6 * _VECTORS), added)):
+            line = builder.mul(step, ir.Constant(index, k // _VECTORS))
+            vectors.store(total, vectors.place(5, begin, line, _LANES * (k % _VECTORS)))
+        return vectors.target.get_dummy_value()
+
+    flat = types.intp
+    return types.void(w, flat, flat, flat, flat, out, flat), generate
+
+
 @compiled
 def reduce(h_pl, keys, start, q, free, by_source, first, pattern, row_start, blocks):
     """Subtract ``H_pl diag(q) H_pl^T`` from the blocks of a pattern with sorted keys.
@@ -106,72 +151,48 @@ def reduce(h_pl, keys, start, q, free, by_source, first, pattern, row_start, blo
     seen from much the same frames, so that their sum is a dense product. ``row_start (n + 1,)`` is of the pattern.
     """
     most, real = 1, h_pl.dtype.type
-    place, members, at = np.empty(free, np.int64), np.empty(free, np.int64), np.empty(free, np.int64)
-    for f in range(free):
-        place[f] = -1
+    place, members = np.full(free, -1, np.int64), np.empty(free, np.int64)
     for s in range(len(first) - 1):
-        if first[s + 1] - first[s] > most:
-            most = first[s + 1] - first[s]
-    w = np.empty((most + 7) * 6 * free, h_pl.dtype)
-    total = np.empty(6 * free, h_pl.dtype)
+        most = max(most, first[s + 1] - first[s])
+    widest = 6 * free + _COLUMNS
+    w, total = np.empty(most * widest, h_pl.dtype), np.empty(6 * widest, h_pl.dtype)
     for s in range(len(first) - 1):
         count = 0
         for p in range(first[s], first[s + 1]):
             k = by_source[p]
             for o in range(start[k], start[k + 1]):
-                f = keys[o] - k * free
-                place[f] = 0
+                place[keys[o] - k * free] = 0
         for f in range(free):
             if place[f] == 0:
                 place[f] = count
                 members[count] = f
                 count += 1
-        if count == 0:
-            continue
-        used, width = 0, 6 * count
+        stride = -(-6 * count // _COLUMNS) * _COLUMNS
+        used = 0
         for p in range(first[s], first[s + 1]):
             k = by_source[p]
             if start[k] == start[k + 1]:
                 continue
-            root, row = math.sqrt(q[k]), w[used * width : (used + 1) * width]
-            for c in range(width):
-                row[c] = real(0)
+            root, row = math.sqrt(q[k]), used * stride
+            for c in range(stride):
+                w[row + c] = real(0)
             for o in range(start[k], start[k + 1]):
-                to = 6 * place[keys[o] - k * free]
+                to = row + 6 * place[keys[o] - k * free]
                 for i in range(6):
-                    row[to + i] = h_pl[o, i] * root
+                    w[to + i] = h_pl[o, i] * root
             used += 1
-        row = w[used * width : (used + 7) * width]  # patches are taken by eight
-        for c in range(7 * width):
-            row[c] = real(0)
         for a in range(count):
             place[members[a]] = -1
+            for column in range(0, 6 * (a + 1), _COLUMNS):
+                _add_up(w, used, stride, 6 * a, column, total, column)  # type: ignore[call-arg]
             search = row_start[members[a]]
             for b in range(a + 1):
                 key = members[a] * free + members[b]
                 while pattern[search] < key:
                     search += 1
-                at[b] = search
-            for i in range(6):
-                length, own = 6 * (a + 1), 6 * a + i
-                for c in range(length):
-                    total[c] = real(0)
-                for p in range(0, used, 8):
-                    w0, w1 = w[p * width : (p + 1) * width], w[(p + 1) * width : (p + 2) * width]
-                    w2, w3 = w[(p + 2) * width : (p + 3) * width], w[(p + 3) * width : (p + 4) * width]
-                    w4, w5 = w[(p + 4) * width : (p + 5) * width], w[(p + 5) * width : (p + 6) * width]
-                    w6, w7 = w[(p + 6) * width : (p + 7) * width], w[(p + 7) * width : (p + 8) * width]
-                    c0, c1, c2, c3 = w0[own], w1[own], w2[own], w3[own]
-                    c4, c5, c6, c7 = w4[own], w5[own], w6[own], w7[own]
-                    for c in range(length):
-                        total[c] += (
-                            c0 * w0[c] + c1 * w1[c] + c2 * w2[c] + c3 * w3[c]
-                            + c4 * w4[c] + c5 * w5[c] + c6 * w6[c] + c7 * w7[c]
-                        )  # fmt: skip
-                for b in range(a + 1):
-                    here = blocks[at[b], i]
+                for i in range(6):
                     for c in range(6):
-                        here[c] -= total[6 * b + c]
+                        blocks[search, i, c] -= total[i * stride + 6 * b + c]
 
 
 @compiled

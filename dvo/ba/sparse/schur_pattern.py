@@ -183,6 +183,11 @@ class SchurPattern:
         return LocalGroups(tuple(chunks), group, place, patch, order, members)
 
     @cached_property
+    def in_reduced(self) -> Tensor:
+        """Position in :attr:`reduced` of each block of ``H_pp``."""
+        return torch.searchsorted(self.reduced.keys, self.h_pp.keys)
+
+    @cached_property
     def reduced(self) -> BlockPattern:
         """Pattern of ``S``."""
         keys = self.h_pp.keys

@@ -63,7 +63,8 @@ def _fill_bounds(context, row, steps, out):
             return [builder.select(builder.icmp_signed(order, value, bound), value, bound) for order, bound in pairs]
 
         first = loaded(ir.Constant(count.type, 0))
-        for k, (name, bound) in enumerate(zip(("smin", "smax"), vectors.repeat(count, [first] * 2, bounded), strict=True)):
+        found = zip(("smin", "smax"), vectors.repeat(count, [first] * 2, bounded), strict=True)
+        for k, (name, bound) in enumerate(found):
             kind = ir.FunctionType(ir.IntType(32), [vectors.whole])
             least = cgutils.get_or_insert_function(builder.module, kind, f"llvm.vector.reduce.{name}.v{LANES}i32")
             bits = in_order(builder.call(least, [bound]))
@@ -118,7 +119,7 @@ def quantise(x: Array, further: Array, rectified: bool, out: Array, scale: Array
             continue
         factor = np.float32(255) / height if height > _LEAST else np.float32(0)
         scale[e], offset[e] = height / np.float32(255), low
-        _fill_levels(row, steps, low, factor, flat, e * size)  # type: ignore[call-arg]
+        _fill_levels(row, steps, low, factor, flat, e * size)
 
 
 @intrinsic
@@ -146,7 +147,7 @@ def _multiply(context, rows, first, size, weights, panel, steps, scales, offsets
             four = builder.mul(step, ir.Constant(index, 4))
             panel = vectors.after(start, builder.mul(step, ir.Constant(index, 4 * COLUMNS)))
             columns = [vectors.raw(vectors.after(panel, 4 * LANES * k), kind) for k in range(_VECTORS)]
-            after = []
+            after: list[Any] = []
             for r, row in enumerate(inputs):
                 own = vectors.everywhere(vectors.raw(vectors.after(row, four), ir.IntType(32)))
                 both = zip(before[r * _VECTORS :], columns, strict=False)

@@ -46,10 +46,12 @@ def _distances(x, first, second, rotation, towards, aside, out):
 
 @part
 def _cost(distances, scale, width):
-    total = 0.0
+    logarithms, product = 0.0, 1.0  # one logarithm for many distances
     for r in distances:
-        total += math.log1p((r / scale) ** 2)
-    return width * width * total
+        product *= 1 + (r / scale) ** 2
+        if product > 1e150:
+            logarithms, product = logarithms + math.log(product), 1.0
+    return width * width * (logarithms + math.log(product))
 
 
 @compiled

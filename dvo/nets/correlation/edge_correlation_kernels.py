@@ -323,7 +323,8 @@ def _corner(x, y, radius, height, width):
     x, y = x - np.float32(radius), y - np.float32(radius)
     x = min(max(x, np.float32(-taps)), np.float32(width - 2 * taps))
     y = min(max(y, np.float32(-taps)), np.float32(height - 2 * taps))
-    left, top = math.floor(x), math.floor(y)
+    left, top = np.int64(x), np.int64(y)  # towards zero; a floor is a call
+    left, top = left - (x < left), top - (y < top)
     return left + taps, top + taps, x - np.float32(left), y - np.float32(top)
 
 

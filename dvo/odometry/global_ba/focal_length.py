@@ -166,15 +166,14 @@ def _find_bend(solve: _Solver, coarse: Minimum, freedom: int, least: float) -> t
     Returns:
         A bend of 0 where it is not surely above it.
     """
-    found = {solve.bend: coarse}
+    found: dict[float, Minimum] = {}
 
     def cost(bend: float, step: float = _STEPS[0]) -> float:
-        if bend not in found or step < _STEPS[0]:
-            near = sorted(found, key=lambda known: abs(known - bend))[:2]
-            start = found[near[0]].value
-            if len(near) == 2:
-                start += (start - found[near[1]].value) * (bend - near[0]) / (near[0] - near[1])
-            found[bend] = solve.focal_minimum(start, step, bend)
+        near = sorted(found, key=lambda known: abs(known - bend))[:2]
+        start = found[near[0]].value if near else coarse.value
+        if len(near) == 2:
+            start += (start - found[near[1]].value) * (bend - near[0]) / (near[0] - near[1])
+        found[bend] = solve.focal_minimum(start, step, bend)
         return solve(found[bend].value, bend=bend)
 
     best = profile_minimum(cost, solve.bend, _BEND_STEPS[0], least, _BENDS[1], freedom)

@@ -127,9 +127,9 @@ def draw_correlation(odometry: PatchOdometry) -> Any:
     maps = encode_image(odometry.model, pair.images[1], odometry.device).matching
     none = torch.zeros(1, dtype=torch.long)
     config = odometry.model.config
-    levels = correlate_reference(
-        window.matching[None, patch : patch + 1], maps, coords, none, none, config.pyramid, config.radius
-    )
+    frame, number = divmod(int(patch), window.per_frame)
+    matching = window.frames[frame].matching[None, number : number + 1]
+    levels = correlate_reference(matching, maps, coords, none, none, config.pyramid, config.radius)
     figure, panels = _panels(10.4, 2.9, 2 + len(levels))
     stride, side = pair.stride, 2 * config.radius + 1
     source = window.patches[patch, :2, 1, 1].numpy() * stride

@@ -123,6 +123,7 @@ def bundle_adjust(
 
 def adjust_dense(given: PatchProblem, options: BAOptions) -> BAResult:
     """The dense solution of a batch that is checked first; see :func:`bundle_adjust` and :func:`dvo.ba.solve.solve`."""
+    use_threads()
     check_structure(given)
     if is_transformed():
         return _transformed(given, options)

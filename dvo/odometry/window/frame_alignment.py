@@ -34,8 +34,9 @@ over the noise of the images; where surfaces are bare or it is dark, few are, an
 MAX_BRIGHTER, MAX_BLUR = 1.05, 0.8
 """Change of the mean grey level since the newest keyframe, as a factor, and share of the sharpness that has to be left,
 for a frame to be aligned with it."""
-MIN_INLIERS, MIN_SHARE, MIN_AGREEMENT = 16, 0.4, 0.6
-"""Patches that have to agree with the pose, their share of those in view, textured or not, and of those aligned."""
+MIN_INLIERS, MIN_SHARE, MIN_AGREEMENT = 16, 0.4, 0.8
+"""Patches that have to agree with the pose, their share of those in view, textured or not, and of those with texture:
+where leaves sway or rain falls, many of these are not found again."""
 INLIER = 0.75
 """Largest distance of such a patch from its reprojection, pixels of the working image."""
 MIN_FIELDS = 6
@@ -221,7 +222,7 @@ class FrameAlignment:
         fields = (measured[agree] / (width, height) * FIELDS).astype(int).clip(0, np.array(FIELDS) - 1)
         count = int(agree.sum())
         sure = (
-            count >= max(MIN_INLIERS, MIN_SHARE * in_view.sum(), MIN_AGREEMENT * len(kept))
+            count >= max(MIN_INLIERS, MIN_SHARE * in_view.sum(), MIN_AGREEMENT * len(rows))
             and len(np.unique(fields @ (FIELDS[1], 1))) >= MIN_FIELDS
         )
         return pose, bool(sure), kept[agree], measured[agree]

@@ -183,9 +183,9 @@ def first_layer(layer: nn.Linear, correlation: Correlation, taps: int) -> Tensor
     return out
 
 
-_ORDERED: WeakKeyDictionary[nn.Linear, tuple[tuple[int | str, ...], tuple[Tensor, ...]]] = WeakKeyDictionary()
-"""Weights of first layers in the order of a correlation, with what they were made from: copying them in each step of a
-tracker takes as long as multiplying by them."""
+_ORDERED: WeakKeyDictionary[nn.Linear, tuple[tuple[int | str, ...], Tensor, tuple[Tensor, ...]]] = WeakKeyDictionary()
+"""Weights of first layers in the order of a correlation, with what they were made from (a change by ``weight.data``
+counts as no version): copying them in each step of a tracker takes as long as multiplying by them."""
 
 
 def _weights_of_levels(layer: nn.Linear, correlation: Correlation, taps: int) -> tuple[Tensor, ...]:
@@ -196,10 +196,11 @@ def _weights_of_levels(layer: nn.Linear, correlation: Correlation, taps: int) ->
         return _ordered(weight, count, correlation.order, taps)
     made_of = weight.data_ptr(), weight._version, count, correlation.order
     found = _ORDERED.get(layer)
-    if found is None or found[0] != made_of:
-        found = made_of, tuple(x.contiguous() for x in _ordered(weight, count, correlation.order, taps))
-        _ORDERED[layer] = found
-    return found[1]
+    on_cpu = weight.device.type == "cpu"  # elsewhere a comparison would wait for the device
+    if found is None or found[0] != made_of or on_cpu and not torch.equal(found[1], weight):
+        ordered = tuple(x.contiguous() for x in _ordered(weight, count, correlation.order, taps))
+        found = _ORDERED[layer] = made_of, weight.detach().clone(), ordered
+    return found[2]
 
 
 def _ordered(weight: Tensor, levels: int, order: str, taps: int) -> tuple[Tensor, ...]:

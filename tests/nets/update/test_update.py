@@ -86,6 +86,17 @@ def test_first_layer_by_levels_equals_dpvos_interleaved_channels():
     )
 
 
+def test_first_layer_has_the_weights_of_now():
+    """Also where these change in ways that torch counts as no version."""
+    layer, generator = torch.nn.Linear(8, 3), torch.Generator().manual_seed(0)
+    levels = [torch.randn(1, 5, 4, generator=generator) for _ in range(2)]
+    interleaved = torch.stack(levels, -1).flatten(2)
+    for change in (lambda w: None, lambda w: w.data.mul_(2), lambda w: w.add_(1)):
+        with torch.no_grad():
+            change(layer.weight)
+            torch.testing.assert_close(first_layer(layer, Correlation(levels), 2), layer(interleaved))
+
+
 def test_gradient_clamp_removes_nan_and_scales_with_the_batch():
     x = torch.zeros(2, 3, 2, requires_grad=True)
     grad = torch.full((2, 3, 2), 5.0)

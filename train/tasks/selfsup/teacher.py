@@ -222,5 +222,8 @@ def flat_weights(net: nn.Module) -> Tensor:
 
 
 def use_weights(net: nn.Module, flat: Tensor) -> None:
-    """Let the parameters of a network be views of a vector, see :func:`flat_weights`."""
-    nn.utils.vector_to_parameters(flat, net.parameters())
+    """Give the parameters of a network the values of a vector, see :func:`flat_weights`."""
+    parameters = list(net.parameters())
+    with torch.no_grad():
+        for parameter, values in zip(parameters, flat.split([p.numel() for p in parameters]), strict=True):
+            parameter.copy_(values.view_as(parameter))

@@ -34,7 +34,7 @@ over the noise of the images; where surfaces are bare or it is dark, few are, an
 MAX_BRIGHTER, MAX_BLUR = 1.05, 0.8
 """Change of the mean grey level since the newest keyframe, as a factor, and share of the sharpness that has to be left,
 for a frame to be aligned with it."""
-MIN_INLIERS, MIN_SHARE, MIN_AGREEMENT = 16, 0.4, 0.8
+MIN_INLIERS, MIN_SHARE, MIN_AGREEMENT = 16, 0.4, 0.75
 """Patches that have to agree with the pose, their share of those in view, textured or not, and of those with texture:
 where leaves sway or rain falls, many of these are not found again."""
 INLIER = 0.75

@@ -215,12 +215,15 @@ def initialise_related(
 def unsupported(window: Window, config: TrackerConfig) -> list[int]:
     """Positions of the frames after the first that are hardly found in those before them: their poses are any.
 
+    Nothing speaks against a frame whose edges have left the window since.
+
     Args:
         window: after some steps.
         config: least support, that of tracked frames.
     """
     least = config.lost_confidence, config.min_inliers
-    return [k for k in range(1, len(window)) if not support_of(window, k).reaches(*least)]
+    found = set(window.jj[window.ii < window.jj].tolist())
+    return [k for k in range(1, len(window)) if k in found and not support_of(window, k).reaches(*least)]
 
 
 def lose_unsupported(graph: KeyframeGraph, config: TrackerConfig) -> None:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dvo.ba.bal import PointProblem
 from dvo.ba.layer.schur import eliminate, factorise, solve_with
+from dvo.core.context import use_threads
 from dvo.core.kernels import available
 from dvo.geometry import se3, so3
 
@@ -183,6 +184,7 @@ def solve_points(
         >>> solution = solve_points(read_bal("problem-21-11315-pre.txt"), fixed=1)
         >>> solution.cost / solution.initial_cost
     """
+    use_threads()
     system = _compiled(problem, fixed) or _Plain(problem, fixed)
     cost = initial = system.cost(problem)
     growth, converged = 2.0, False

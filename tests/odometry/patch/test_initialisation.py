@@ -125,6 +125,13 @@ def _turning_window(frames=7, found=4):
     return graph, true
 
 
+def test_nothing_speaks_against_a_frame_whose_edges_have_left_the_window():
+    window = _turning_window()[0].window
+    assert unsupported(window, CONFIG) == [4, 5, 6]
+    window.keep((window.jj != 5) | (window.ii >= 5))
+    assert unsupported(window, CONFIG) == [4, 6]
+
+
 def test_frames_that_a_first_solution_hardly_finds_begin_where_the_motion_leads_them(monkeypatch):
     (graph, true), starts = _turning_window(), []
     measured = graph.window.targets, graph.window.patches

@@ -73,15 +73,36 @@ class Vectors:
         first = self.builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
         return self.builder.shuffle_vector(first, undefined, ir.Constant(self.whole, [0] * self.lanes))
 
-    def repeat(self, count: Any, values: Sequence[Any], body: Callable[[Any, list[Any]], list[Any]]) -> list[Any]:
-        """Values after ``values = body(k, values)`` for each ``k`` below a count of one or more; no branches in it."""
+    def shuffled(self, a: Any, b: Any, lanes: Sequence[int]) -> Any:
+        """Lanes of two vectors side by side."""
+        return self.builder.shuffle_vector(a, b, ir.Constant(self.whole, list(lanes)))
+
+    def call(self, name: str, kept: ir.Type, *given: Any) -> Any:
+        """Value of an instruction of the compiler, by its name."""
+        kind = ir.FunctionType(kept, [value.type for value in given])
+        return self.builder.call(cgutils.get_or_insert_function(self.builder.module, kind, name), given)
+
+    def plus(self, before: Any, a: Any, b: Any) -> Any:
+        """Sum and product, one instruction where there is one."""
+        return self.builder.fadd(before, self.builder.fmul(a, b, **CONTRACT), **CONTRACT)
+
+    def repeat(
+        self, count: Any, values: Sequence[Any], body: Callable[[Any, list[Any]], list[Any]], step: int = 1
+    ) -> list[Any]:
+        """Values after ``values = body(k, values)`` for each multiple ``k`` of a step below a count of one or more; no
+        branches in it. Without a loop where the count is a number."""
+        if isinstance(count, int):
+            after = list(values)
+            for multiple in range(0, count, step):
+                after = body(ir.Constant(self.index, multiple), after)
+            return after
         builder, entry = self.builder, self.builder.block
         loop, end = builder.append_basic_block(), builder.append_basic_block()
         builder.branch(loop)
         builder.position_at_end(loop)
         k, before = builder.phi(self.index), [builder.phi(value.type) for value in values]
         after = body(k, before)
-        following = builder.add(k, ir.Constant(self.index, 1))
+        following = builder.add(k, ir.Constant(self.index, step))
         builder.cbranch(builder.icmp_signed("<", following, count), loop, end)
         begun = [ir.Constant(self.index, 0), *values]
         for value, first, further in zip([k, *before], begun, [following, *after], strict=True):

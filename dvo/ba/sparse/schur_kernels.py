@@ -12,7 +12,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from dvo.core.compiled import compiled
-from dvo.core.vectors import CONTRACT, Vectors
+from dvo.core.vectors import Vectors
 
 _LANES = 8 if llvmlite.binding.get_host_cpu_features().get("avx512f") else 4
 _VECTORS = 2
@@ -130,8 +130,7 @@ def _add_up(context, w, patches, stride, own, column, out, to):
             for i in range(6):
                 factor = vectors.everywhere(builder.load(vectors.after(row, six, i)))
                 for k, value in enumerate(columns):
-                    product = builder.fmul(factor, value, **CONTRACT)
-                    after.append(builder.fadd(before[i * _VECTORS + k], product, **CONTRACT))
+                    after.append(vectors.plus(before[i * _VECTORS + k], factor, value))
             return after
 
         for k, total in enumerate(vectors.repeat(count, [nothing] * (6 * _VECTORS), added)):

@@ -24,6 +24,7 @@ from numba.extending import intrinsic
 
 from dvo.core.compiled import compiled, part
 from dvo.core.number_kernels import number, stored
+from dvo.core.vectors import Vectors
 
 _WIDTH = 8
 _CHANNELS = 64  # of the features of the default network
@@ -47,29 +48,6 @@ class _BFloat(ir.HalfType):  # llvmlite has none
 _BFLOATS, _BFLOATS_KEPT = (ir.VectorType(object.__new__(_BFloat), size) for size in (_PAIRED, _WIDTH))
 
 
-def _added(builder: Any, sums: list[Any], added: Any, known: int | None, channels: Any, step: int) -> list[Any]:
-    """Sums after ``added(sums, channel)`` for every channel that is a multiple of a step, in a loop unless it is known
-    how many there are."""
-    index = channels.type
-    if known is not None:
-        for channel in range(0, known, step):
-            sums = added(sums, ir.Constant(index, channel))
-        return sums
-    entry, loop, end = builder.block, builder.append_basic_block(), builder.append_basic_block()
-    builder.branch(loop)
-    builder.position_at_end(loop)
-    channel, before = builder.phi(index), [builder.phi(value.type) for value in sums]
-    after = added(before, channel)
-    following = builder.add(channel, ir.Constant(index, step))
-    builder.cbranch(builder.icmp_signed("<", following, channels), loop, end)
-    begun = [ir.Constant(index, 0), *sums]
-    for value, first, further in zip([channel, *before], begun, [following, *after], strict=True):
-        value.add_incoming(first, entry)
-        value.add_incoming(further, loop)
-    builder.position_at_end(end)
-    return after
-
-
 @intrinsic(prefer_literal=True)
 def _window_products(
     context, maps, first, line, features, own, channels, scales, pixel, width, factor, total, out
@@ -88,80 +66,63 @@ def _window_products(
     known = channels.literal_value if isinstance(channels, types.IntegerLiteral) else None
     kind = {types.float32: _VECTOR, types.uint16: _BFLOATS, types.uint8: _WHOLE}[maps.dtype]
 
-    def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
-        index = given[1].type
-
-        def place(k: int, at: Any) -> Any:
-            array = cgutils.create_struct_proxy(signature.args[k])(target, builder, value=given[k])
-            return builder.gep(array.data, [at])
-
-        def loaded(pointer: Any, kind: Any = kind) -> Any:
-            align = 4 if maps.dtype == types.float32 else 1
-            return builder.load(builder.bitcast(pointer, kind.as_pointer()), align=align)
-
-        def everywhere(value: Any) -> Any:
-            kind = ir.VectorType(value.type, _WIDTH)
-            first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-            return builder.shuffle_vector(first, first, ir.Constant(_WHOLE, [0] * _WIDTH))
+    def generate(*generating: Any) -> Any:
+        vectors, (_, first, line, _, own, channels, _, pixel, width, factor, total, _) = (
+            Vectors(_WIDTH, *generating), generating[3])  # fmt: skip
+        builder, count = vectors.builder, known or channels
+        start, feature = vectors.place(0, first), vectors.place(3, own)
+        align = 4 if maps.dtype == types.float32 else 1
 
         def plus(before: Any, a: Any, b: Any) -> Any:
             if kind == _VECTOR:
-                return builder.fadd(before, builder.fmul(a, b, flags=("contract",)), flags=("contract",))
+                return vectors.plus(before, a, b)
             name = "avx512.vpdpbusd.256" if kind == _WHOLE else "avx512bf16.dpbf16ps.256"
-            of_unit = ir.FunctionType(before.type, [before.type, kind, kind])
-            unit = cgutils.get_or_insert_function(builder.module, of_unit, f"llvm.x86.{name}")
-            return builder.call(unit, [before, a, b])
-
-        def stored(row: Any, value: Any) -> None:
-            to = place(11, builder.mul(row, ir.Constant(index, _WIDTH)))
-            builder.store(value, builder.bitcast(to, _VECTOR.as_pointer()), align=4)
-
-        channels = given[5] if known is None else ir.Constant(index, known)
-        start, feature = place(0, given[1]), place(3, given[4])
+            return vectors.call(f"llvm.x86.{name}", before.type, before, a, b)
 
         def of_pixels(row: Any) -> None:
             """Eight sums, each of products of one pixel."""
-            begin = builder.gep(start, [builder.mul(row, given[2])])
+            begin = vectors.after(start, builder.mul(row, line))
+            size = ir.Constant(vectors.index, known) if known else channels
 
-            def added(sums: Any, channel: Any) -> Any:
-                part, pixel, after = loaded(builder.gep(feature, [channel])), builder.gep(begin, [channel]), []
+            def added(channel: Any, sums: list[Any]) -> list[Any]:
+                part, pixel = vectors.raw(vectors.after(feature, channel), kind, align), vectors.after(begin, channel)
+                after = []
                 for before in sums:
-                    after.append(plus(before, part, loaded(pixel)))
-                    pixel = builder.gep(pixel, [channels])
+                    after.append(plus(before, part, vectors.raw(pixel, kind, align)))
+                    pixel = vectors.after(pixel, size)
                 return after
 
-            nothing = [ir.Constant(_VECTOR, [0.0] * _WIDTH)] * _WIDTH
-            after = _added(builder, nothing, added, known, channels, kind.count)
+            after = vectors.repeat(count, [vectors.constant(0.0)] * _WIDTH, added, kind.count)
             for folding in _FOLDINGS:
-                lanes = [ir.Constant(_WHOLE, list(order)) for order in folding]
                 pairs = zip(after[::2], after[1::2], strict=True)
-                after = [builder.fadd(*(builder.shuffle_vector(a, b, order) for order in lanes)) for a, b in pairs]
-            stored(row, after[0])
+                after = [builder.fadd(*(vectors.shuffled(a, b, lanes) for lanes in folding)) for a, b in pairs]
+            vectors.store(after[0], vectors.place(11, builder.mul(row, ir.Constant(vectors.index, _WIDTH))))
 
         def of_rows() -> None:
             """Sums of each row, whose lanes are those of its pixels."""
 
-            def added(sums: Any, channel: Any) -> Any:
-                four = everywhere(loaded(builder.gep(feature, [channel]), ir.IntType(32)))
-                pixels, after = builder.gep(start, [builder.mul(channel, given[8])]), []
+            def added(channel: Any, sums: list[Any]) -> list[Any]:
+                four = vectors.everywhere(vectors.raw(vectors.after(feature, channel), ir.IntType(32)))
+                pixels, after = vectors.after(start, builder.mul(channel, width)), []
                 for before in sums:
-                    after.append(plus(before, loaded(pixels), four))
-                    pixels = builder.gep(pixels, [given[2]])
+                    after.append(plus(before, vectors.raw(pixels, kind, align), four))
+                    pixels = vectors.after(pixels, line)
                 return after
 
-            nothing = [ir.Constant(_WHOLE, [0] * _WIDTH)] * _WIDTH
-            total, factor, beside = everywhere(given[10]), everywhere(given[9]), place(6, given[7])
-            for row, value in enumerate(_added(builder, nothing, added, known, channels, BYTES)):
-                whole = builder.sitofp(builder.sub(value, total), _VECTOR)
-                stored(ir.Constant(index, row), builder.fmul(whole, builder.fmul(loaded(beside, _VECTOR), factor)))
-                beside = builder.gep(beside, [given[8]])
+            sums = vectors.repeat(count, [vectors.constant(0)] * _WIDTH, added, BYTES)
+            most, scale, beside = vectors.everywhere(total), vectors.everywhere(factor), vectors.place(6, pixel)
+            for row, value in enumerate(sums):
+                whole = builder.sitofp(builder.sub(value, most), _VECTOR)
+                scaled = builder.fmul(whole, builder.fmul(vectors.load(beside), scale))
+                vectors.store(scaled, vectors.place(11, _WIDTH * row))
+                beside = vectors.after(beside, width)
 
         if kind == _WHOLE:
             of_rows()
         else:
-            with cgutils.for_range(builder, ir.Constant(index, _WIDTH)) as loop:
+            with cgutils.for_range(builder, ir.Constant(vectors.index, _WIDTH)) as loop:
                 of_pixels(loop.index)
-        return target.get_dummy_value()
+        return vectors.target.get_dummy_value()
 
     at, number = types.intp, types.float32
     of_channels = at if known is None else channels
@@ -174,14 +135,13 @@ def _window_products(
 def _fetch(context, flat, position):
     """Ask for the cache line with an element of a flat array, which is read soon."""
 
-    def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
-        array = cgutils.create_struct_proxy(signature.args[0])(target, builder, value=given[0])
+    def generate(*generating: Any) -> Any:
+        vectors, (_, position) = Vectors(1, *generating), generating[3]
         byte, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [byte, flag, flag, flag])
-        fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        place = builder.bitcast(builder.gep(array.data, [given[1]]), byte)
-        builder.call(fetch, [place, *(ir.Constant(flag, value) for value in (0, 3, 1))])  # to read, near, data
-        return target.get_dummy_value()
+        place = vectors.builder.bitcast(vectors.place(0, position), byte)
+        how = (ir.Constant(flag, value) for value in (0, 3, 1))  # to read, near, data
+        vectors.call("llvm.prefetch.p0", ir.VoidType(), place, *how)
+        return vectors.target.get_dummy_value()
 
     return types.void(flat, types.intp), generate
 
@@ -193,95 +153,67 @@ def _blend_eight(context, products, fx, fy, out, position):
     ``out`` is of float32, or holds bits of bfloat16.
     """
     single = out.dtype == types.float32
-    kept = _VECTOR if single else _BFLOATS_KEPT
 
-    def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
-        def vector(k: int, place: Any, kind: Any) -> Any:
-            array = cgutils.create_struct_proxy(signature.args[k])(target, builder, value=given[k])
-            return builder.bitcast(builder.gep(array.data, [place]), kind.as_pointer())
-
-        def rounded(row: Any) -> Any:
-            kind = ir.FunctionType(kept, [_VECTOR])
-            unit = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512bf16.cvtneps2bf16.256")
-            return builder.call(unit, [row])
-
-        def shuffled(a: Any, b: Any, lanes: Any) -> Any:
-            return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), lanes))
-
-        def everywhere(value: Any) -> Any:
-            first = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-            return shuffled(first, first, [0] * _WIDTH)
+    def generate(*generating: Any) -> Any:
+        vectors, (_, fx, fy, _, position) = Vectors(_WIDTH, *generating), generating[3]
+        builder, shuffled = vectors.builder, vectors.shuffled
 
         def between(a: Any, b: Any, share: Any) -> Any:
-            step = builder.fmul(share, builder.fsub(b, a), flags=("contract",))
-            return builder.fadd(a, step, flags=("contract",))
+            return vectors.plus(a, share, builder.fsub(b, a))
 
-        def place(at: int) -> Any:
-            return ir.Constant(given[4].type, at)
+        def stored(row: Any, place: Any) -> None:
+            if single:
+                vectors.store(row, place)
+                return
+            half = vectors.call("llvm.x86.avx512bf16.cvtneps2bf16.256", _BFLOATS_KEPT, row)
+            builder.store(half, builder.bitcast(place, _BFLOATS_KEPT.as_pointer()), align=2)
 
-        fx, fy = everywhere(given[1]), everywhere(given[2])
-        rows = [builder.load(vector(0, place(_WIDTH * i), _VECTOR), align=4) for i in range(_WIDTH)]
+        fx, fy = vectors.everywhere(fx), vectors.everywhere(fy)
+        rows = [vectors.load(vectors.place(0, _WIDTH * i)) for i in range(_WIDTH)]
         before = None
         for i in range(_WIDTH - 1):
             across = between(rows[i], rows[i + 1], fy)
-            row = between(across, shuffled(across, across, [1, 2, 3, 4, 5, 6, 7, 7]), fx)
-            at = builder.add(given[4], place((_WIDTH - 1) * i))
+            row, at = between(across, shuffled(across, across, [1, 2, 3, 4, 5, 6, 7, 7]), fx), (_WIDTH - 1) * i
             if i == _WIDTH - 2:  # the last lane of a row is overwritten by the next, and this has none
-                row, at = shuffled(before, row, [6, 8, 9, 10, 11, 12, 13, 14]), builder.sub(at, place(1))
-            builder.store(row if single else rounded(row), vector(3, at, kept), align=4 if single else 2)
+                row, at = shuffled(before, row, [6, 8, 9, 10, 11, 12, 13, 14]), at - 1
+            stored(row, vectors.place(3, position, at))
             before = row
-        return target.get_dummy_value()
+        return vectors.target.get_dummy_value()
 
     return types.void(products, types.float32, types.float32, out, types.intp), generate
 
 
 @intrinsic
-def _eight_adjoints(context, maps, first, d_maps, feature, d_feature, weights, position):
+def _eight_adjoints(context, maps, first, d_maps, feature, d_feature, channels, weights, position):
     """Take eight products back, of which ``weights`` holds the gradients from ``position``.
 
     ``d_maps`` receives those of the eight pixels from ``first``, ``d_feature`` that of the feature. Maps and
-    weights are flat; all arrays are contiguous and of float32; the channels are a multiple of eight.
+    weights are flat; all arrays are contiguous and of float32; the number of channels is a multiple of eight.
     """
 
-    def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
-        def array(k: int) -> Any:
-            return cgutils.create_struct_proxy(signature.args[k])(target, builder, value=given[k])
+    def generate(*generating: Any) -> Any:
+        vectors, (_, first, _, _, _, channels, _, position) = Vectors(_WIDTH, *generating), generating[3]
+        plus = vectors.plus
+        start, d_start = vectors.place(0, first), vectors.place(2, first)
+        own = vectors.load(vectors.place(6, position))
+        each = [vectors.shuffled(own, own, [k] * _WIDTH) for k in range(_WIDTH)]
 
-        def vector(pointer: Any) -> Any:
-            return builder.bitcast(pointer, _VECTOR.as_pointer())
+        def taken_back(channel: Any, none: list[Any]) -> list[Any]:
+            part, d_feature_at = vectors.load(vectors.place(3, channel)), vectors.place(4, channel)
+            total = vectors.load(d_feature_at)
+            pixel, d_pixel = vectors.after(start, channel), vectors.after(d_start, channel)
+            for weight in each:
+                total = plus(total, weight, vectors.load(pixel))
+                vectors.store(plus(vectors.load(d_pixel), weight, part), d_pixel)
+                pixel, d_pixel = vectors.after(pixel, channels), vectors.after(d_pixel, channels)
+            vectors.store(total, d_feature_at)
+            return none
 
-        def plus(before: Any, a: Any, b: Any) -> Any:
-            return builder.fadd(before, builder.fmul(a, b, flags=("contract",)), flags=("contract",))
+        vectors.repeat(channels, [], taken_back, _WIDTH)
+        return vectors.target.get_dummy_value()
 
-        channels = builder.extract_value(array(3).shape, 0)
-        start, d_start = (builder.gep(array(k).data, [given[1]]) for k in (0, 2))
-        own = builder.load(vector(builder.gep(array(5).data, [given[6]])), align=4)
-        lanes = ir.VectorType(ir.IntType(32), _WIDTH)
-        each = [builder.shuffle_vector(own, own, ir.Constant(lanes, [k] * _WIDTH)) for k in range(_WIDTH)]
-        entry, loop, end = builder.block, builder.append_basic_block(), builder.append_basic_block()
-        builder.branch(loop)
-
-        builder.position_at_end(loop)
-        channel = builder.phi(channels.type)
-        feature_part = builder.load(vector(builder.gep(array(3).data, [channel])), align=4)
-        d_feature_at = vector(builder.gep(array(4).data, [channel]))
-        total = builder.load(d_feature_at, align=4)
-        pixel, d_pixel = builder.gep(start, [channel]), builder.gep(d_start, [channel])
-        for weight in each:
-            total = plus(total, weight, builder.load(vector(pixel), align=4))
-            sums = plus(builder.load(vector(d_pixel), align=4), weight, feature_part)
-            builder.store(sums, vector(d_pixel), align=4)
-            pixel, d_pixel = builder.gep(pixel, [channels]), builder.gep(d_pixel, [channels])
-        builder.store(total, d_feature_at, align=4)
-        following = builder.add(channel, ir.Constant(channels.type, _WIDTH))
-        builder.cbranch(builder.icmp_signed("<", following, channels), loop, end)
-        channel.add_incoming(ir.Constant(channels.type, 0), entry)
-        channel.add_incoming(following, loop)
-
-        builder.position_at_end(end)
-        return target.get_dummy_value()
-
-    return types.void(maps, types.intp, d_maps, feature, d_feature, weights, types.intp), generate
+    at = types.intp
+    return types.void(maps, at, d_maps, feature, d_feature, at, weights, at), generate
 
 
 @part
@@ -306,7 +238,8 @@ def _adjoint_of_products(maps, d_maps, first, stride, feature, d_feature, weight
         for row in range(taps):
             for left in range(0, taps, _WIDTH):
                 at = first + row * stride + left * channels
-                _eight_adjoints(maps, at, d_maps, feature, d_feature, flat, row * taps + left)  # type: ignore[call-arg]
+                own = row * taps + left
+                _eight_adjoints(maps, at, d_maps, feature, d_feature, channels, flat, own)  # type: ignore[call-arg]
         return
     for row in range(taps):
         for column in range(taps):

@@ -45,8 +45,7 @@ def _add_runs(context, x, first, pixels, channels, mean, channel, squares, runs,
             pointer, after = vectors.after(start, builder.mul(pixel, stride)), []
             for before in sums:
                 value = builder.fsub(vectors.load(pointer), level)
-                term = builder.fmul(value, builder.select(chosen, value, one), **CONTRACT)
-                after.append(builder.fadd(term, before, **CONTRACT))
+                after.append(vectors.plus(before, value, builder.select(chosen, value, one)))
                 pointer = vectors.after(pointer, run)
             return after
 

@@ -162,7 +162,7 @@ def _multiply(context, rows, first, size, weights, panel, steps, scales, offsets
                 size, low = (vectors.everywhere(builder.load(vectors.place(n, given[8], r))) for n in (6, 7))
                 value = builder.sitofp(sums[r * _VECTORS + k], vectors.floats)
                 value = builder.fmul(value, builder.fmul(size, scale, **CONTRACT), **CONTRACT)
-                rest = builder.fadd(builder.fmul(low, total, **CONTRACT), bias, **CONTRACT)
+                rest = vectors.plus(bias, low, total)
                 line = builder.add(given[12], builder.mul(given[13], ir.Constant(index, r)))
                 vectors.store(builder.fadd(value, rest, **CONTRACT), vectors.place(11, line, k * LANES))
         return vectors.target.get_dummy_value()

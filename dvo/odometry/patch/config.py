@@ -147,7 +147,7 @@ class TrackerConfig:
         DvoError: a value of the wrong type or out of range, with the name of the setting.
 
     Example:
-        >>> config = dvo.TrackerConfig(patches=48, optimisation=10)
+        >>> config = dvo.TrackerConfig(patches=48, optimisation=12)
         >>> odometry = dvo.load("small", config=config)
     """
 
@@ -158,10 +158,10 @@ class TrackerConfig:
     align_gain: float = 10.0
     align_reach: float = 0.3
     align_slope: float = 0.0
-    lifetime: int = 7
-    edges: Literal["all", "spread"] = "all"
-    removal: int = 9
-    optimisation: int = 8
+    lifetime: int = 10
+    edges: Literal["all", "spread"] = "spread"
+    removal: int = 10
+    optimisation: int = 10
     initial_frames: int = 5
     initial_updates: int = 16
     final_updates: int = 2
@@ -289,6 +289,7 @@ TRACKER_PRESETS: dict[str, TrackerConfig] = {
         pixels=0,
         patches=48,
         lifetime=11,
+        edges="all",
         removal=16,
         optimisation=7,
         initial_frames=8,

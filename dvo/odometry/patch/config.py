@@ -34,6 +34,7 @@ on a CPU with instructions for it. ``auto``: int8 or bfloat16 on a CPU with inst
 InitialPose = Literal["motion", "nearest"]
 """First pose of a new frame: of the motion model, or from matches with the newest keyframe."""
 
+_BESIDE_SAMPLES = {"lifetime": 7, "removal": 9, "optimisation": 8}
 _RANGES = {
     "pixels": (0, 2**28),
     "patches": (1, 2**14),
@@ -85,7 +86,8 @@ class TrackerConfig:
             that leave the window finds too (:mod:`dvo.nets.patch.slopes`); 0: surfaces of constant depth.
         lifetime: largest distance, in frames, of the edges of a patch from its own frame.
         edges: frames up to this distance that a patch has edges into: ``all``, or ``spread``, the next four and every
-            second one of the others, so that as many edges see a point from places farther apart (docs/precision.md).
+            second one of the others, so that as many edges see a point from places farther apart (docs/precision.md);
+            where inertial samples tell the scale, all up to 7 away.
         removal: age, in frames, above which the edges of a frame's patches are archived.
         optimisation: number of newest frames whose poses are optimised.
         final_adjustment: solve for all frames of a segment at once in ``finish``
@@ -242,6 +244,15 @@ class TrackerConfig:
         """Distances of the edges of a patch from its own frame, in frames."""
         every = range(1, self.lifetime + 1)
         return tuple(d for d in every if self.edges == "all" or d <= 4 or d % 2 == 0 or d == self.lifetime)
+
+    @cached_property
+    def beside_samples(self) -> TrackerConfig:
+        """Settings where inertial samples hold the unit: a window that is narrower follows them sooner, and poses as
+        they come stay nearer to metres (docs/inertial.md, "In the window")."""
+        if self.edges == "all":
+            return self
+        sizes = {name: min(getattr(self, name), most) for name, most in _BESIDE_SAMPLES.items()}
+        return replace(self, edges="all", **sizes)
 
     @property
     def aligned_motion(self) -> float:

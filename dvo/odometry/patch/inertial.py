@@ -112,6 +112,11 @@ class InertialTracking:
         self._way = 0.0  # metres since the alignment
         self._last_adjusted = -np.inf  # time of the newest frame of the last adjustment beside tracking
 
+    @property
+    def tells_scale(self) -> bool:
+        """There are samples, and the scale has no other source."""
+        return self.active and not self.metric
+
     def turns(self, *, told: bool = False) -> Turns | None:
         """Rotations during the readout of a rolling shutter: none in the images of frames that were read at once.
 
@@ -134,7 +139,7 @@ class InertialTracking:
             The same, or one whose camera has a global shutter.
         """
         camera, errors = admitted.camera, self._errors
-        if not self.active or self.metric or camera.readout <= 0 or errors is None:
+        if not self.tells_scale or camera.readout <= 0 or errors is None:
             return admitted
         if errors[0] > max(MOST_WRONG**2 * errors[2], LEAST_WRONG**2):
             return admitted
@@ -363,7 +368,7 @@ class InertialTracking:
         """
         graph, window = self.graph, self.graph.window
         maintenance.awaited = False
-        if not self.active or self.metric or self._anchor is not None or window.guests or not len(window):
+        if not self.tells_scale or self._anchor is not None or window.guests or not len(window):
             return
         if window.frames[-1].timestamp < self._last_adjusted + ADJUST_EVERY:
             return

@@ -188,6 +188,7 @@ class InertialEstimator:
         state: what is known.
         reason: why there is no alignment (yet), why one was withdrawn or is in doubt; empty otherwise.
         worlds: similarity by the number of the world of visual poses, of those that are aligned.
+        untold: worlds whose scale the samples do not tell, at the end: too short, or without changes of speed.
         stream: samples.
         solution: newest estimate that passed the tests; None before it.
         history: what has happened, for run.json.
@@ -198,6 +199,7 @@ class InertialEstimator:
         self.stream = SampleStream()
         self.state, self.reason = ScaleState.NONE, ""
         self.worlds: dict[int, Similarity] = {}
+        self.untold: set[int] = set()
         self.solution: Smoothed | None = None
         self.history: list[dict[str, Any]] = []
         self.noise: ImuNoise = NOISE_PRESETS["phone"]
@@ -229,6 +231,11 @@ class InertialEstimator:
         """What is known of the present scale."""
         in_doubt = self._doubtful or self._silent or self._failing < np.inf
         return ScaleState.INITIALISING if self.aligned and in_doubt else self.state
+
+    @property
+    def _most_sigma(self) -> float:
+        """Relative deviation of the scale up to which a new segment joins a metric trajectory."""
+        return 2 * self.options.max_scale_sigma
 
     @property
     def holds_unit(self) -> bool:
@@ -670,7 +677,12 @@ class InertialEstimator:
             self.history.append(
                 {"time": self._aligned, "event": "aligned at the end", "scale_sigma": sigma or found.scale_sigma}
             )
+        before = set(self.worlds)
         self._take(found, worlds)
+        if before:
+            told = {w for w, s in zip(worlds, found.segment_sigmas, strict=True) if s <= self._most_sigma}
+            self.untold = set(worlds) - told - before
+            self.worlds = {world: known for world, known in self.worlds.items() if world not in self.untold}
         self._doubtful, self._failing = False, np.inf  # that was of the newest poses
         late = end + found.time_offset - self.stream.end
         self.reason = f"no samples for the last {late:.0f} s" if late > self.options.longest else ""
@@ -1014,7 +1026,7 @@ class InertialEstimator:
             self.history.append({"time": time, "event": "aligned", "scale_sigma": found.scale_sigma})
             return
         new = worlds[-1] not in self.worlds
-        if not new or found.scale_sigma <= 2 * self.options.max_scale_sigma:
+        if not new or found.scale_sigma <= self._most_sigma:
             self._take(found, worlds)
         elif found.scale_sigma < NOTHING_TOLD:  # a new segment, whose scale is not sure yet
             self.solution, self._known = found, list(worlds[: len(found.worlds.log_scale)])

@@ -229,6 +229,11 @@ class Smoothed:
         return float(np.sqrt(part.sum()))
 
     @property
+    def segment_sigmas(self) -> Array:
+        """``(S,)`` relative standard deviations of the scale at the first node of each segment."""
+        return np.sqrt(np.diag(self.covariance)[NODE + _SEGMENT :: 4])
+
+    @property
     def gravity_sigma(self) -> float:
         """Standard deviation of the vertical at the newest node, degrees."""
         turned = self.rotation[-1] @ self.covariance[:3, :3] @ self.rotation[-1].T

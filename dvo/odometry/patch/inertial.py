@@ -311,6 +311,7 @@ class InertialTracking:
         smoothed = estimator.settle(nodes, worlds, closer) if len(nodes) else None
         if not estimator.aligned:
             return {"inertial": estimator.information()}
+        self._predict_untold()
         # A segment may have been joined to an earlier world since its similarity was found.
         found = {graph.world_of(world): estimator.worlds[world] for world in sorted(estimator.worlds, reverse=True)}
         units: dict[int, float] = {}
@@ -602,6 +603,17 @@ class InertialTracking:
         found = camera_pose(state, solution.rotation_camera_imu, self.estimator.translation_camera_imu)
         pose_wc = pose_from(similarity.rotation.T @ found[0], similarity.inverse_points(found[1]))
         return se3.inverse(torch.from_numpy(pose_wc))
+
+    def _predict_untold(self) -> None:
+        """Take the poses by images from short segments whose scale is not told: samples predict their frames, too."""
+        graph, untold = self.graph, self.estimator.untold
+        for world in untold:
+            mine = [
+                record for record in graph.log.frames if not record.lost and graph.world_of(record.segment) == world
+            ]
+            if mine and mine[-1].timestamp - mine[0].timestamp <= self.options.longest:
+                for record in mine:
+                    record.anchor, record.relative, record.lost, record.inertial = None, None, True, True
 
     def _fill(self, smoothed: Smoothed) -> None:
         """Poses of the frames that were bridged: predicted from the smoothed state before, and led to the one after."""

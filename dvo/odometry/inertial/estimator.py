@@ -188,7 +188,7 @@ class InertialEstimator:
         state: what is known.
         reason: why there is no alignment (yet), why one was withdrawn or is in doubt; empty otherwise.
         worlds: similarity by the number of the world of visual poses, of those that are aligned.
-        untold: worlds whose scale the samples do not tell, at the end: too short, or without changes of speed.
+        untold: worlds whose scale the samples do not tell at the end: they are short, or do not change their speed.
         stream: samples.
         solution: newest estimate that passed the tests; None before it.
         history: what has happened, for run.json.
@@ -677,12 +677,8 @@ class InertialEstimator:
             self.history.append(
                 {"time": self._aligned, "event": "aligned at the end", "scale_sigma": sigma or found.scale_sigma}
             )
-        before = set(self.worlds)
         self._take(found, worlds)
-        if before:
-            told = {w for w, s in zip(worlds, found.segment_sigmas, strict=True) if s <= self._most_sigma}
-            self.untold = set(worlds) - told - before
-            self.worlds = {world: known for world, known in self.worlds.items() if world not in self.untold}
+        self.untold = set(worlds) - set(self.worlds)
         self._doubtful, self._failing = False, np.inf  # that was of the newest poses
         late = end + found.time_offset - self.stream.end
         self.reason = f"no samples for the last {late:.0f} s" if late > self.options.longest else ""
@@ -1066,9 +1062,12 @@ class InertialEstimator:
     def _follow(self, found: Smoothed) -> None:
         self.solution = found
         self._tell()
+        told = found.segment_sigmas <= self._most_sigma
+        told[-1] |= found.scale_sigma <= self._most_sigma or not self.worlds
         for k, world in enumerate(self._known):
             w = found.worlds
-            self.worlds[world] = Similarity(float(np.exp(w.log_scale[k])), w.rotation[k], w.translation[k])
+            if told[k] or world in self.worlds:
+                self.worlds[world] = Similarity(float(np.exp(w.log_scale[k])), w.rotation[k], w.translation[k])
 
 
 def _chosen(nodes: VisualNodes, worlds: list[int], keep: Array) -> tuple[VisualNodes, list[int]]:

@@ -631,12 +631,13 @@ class InertialTracking:
                 smoothed.gyro_bias[last], smoothed.accel_bias[last], np.zeros((15, 15)),
             )  # fmt: skip
             wanted = times[begin:end]
-            after = smoothed.times[last + 1] if last + 1 < len(smoothed.times) else None
+            then = int(np.searchsorted(smoothed.times, wanted[-1], "right"))
+            after = smoothed.times[then] if then < len(smoothed.times) else None
             states = estimator.predict(start, wanted if after is None else np.append(wanted, after))
             cameras = [camera_pose(state, turn, shift) for state in states]
             poses = np.stack([pose_from(*camera) for camera in cameras])
             if after is not None:
-                goal = replace(states[-1], rotation=smoothed.rotation[last + 1], position=smoothed.position[last + 1])
+                goal = replace(states[-1], rotation=smoothed.rotation[then], position=smoothed.position[then])
                 poses = _led(
                     poses[:-1], wanted, start.time, float(after), poses[-1], pose_from(*camera_pose(goal, turn, shift))
                 )

@@ -622,7 +622,7 @@ class InertialTracking:
         bridged = np.array([record.inertial and record.lost for record in log.frames])
         turn, shift = smoothed.rotation_camera_imu, estimator.translation_camera_imu
         for begin, end in _runs(bridged):
-            last = int(np.searchsorted(smoothed.times, times[begin], "right")) - 1
+            last = int(np.searchsorted(smoothed.times, times[begin] - SAME_TIME)) - 1
             anchor = log.frames[begin - 1].anchor if begin else None
             if last < 0 or anchor is None:
                 continue
@@ -631,7 +631,7 @@ class InertialTracking:
                 smoothed.gyro_bias[last], smoothed.accel_bias[last], np.zeros((15, 15)),
             )  # fmt: skip
             wanted = times[begin:end]
-            then = int(np.searchsorted(smoothed.times, wanted[-1], "right"))
+            then = int(np.searchsorted(smoothed.times, wanted[-1] + SAME_TIME))
             after = smoothed.times[then] if then < len(smoothed.times) else None
             states = estimator.predict(start, wanted if after is None else np.append(wanted, after))
             cameras = [camera_pose(state, turn, shift) for state in states]

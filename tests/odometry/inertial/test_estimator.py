@@ -489,6 +489,20 @@ def test_the_first_poses_of_a_segment_do_not_accuse_the_sensor() -> None:
     assert [entry["event"] for entry in estimator.history] == ["aligned"]
 
 
+def test_a_segment_whose_scale_is_not_told_is_not_in_metres_at_the_end() -> None:
+    """Images of it stand still where the samples move: no unit fits."""
+    recording = record(11, seconds=14.0)
+    estimator, _ = drive(recording, until=7.0)
+    estimator.add(recording.samples.between(estimator.stream.end, 14.0))
+    nodes = parts(recording, [(0.0, 7.0), (7.2, 7.5), (7.7, 13.0)], [SAME, OTHER, OTHER])
+    still = nodes.segment == 1
+    place = np.where(still[:, None], nodes.position[still][0], nodes.position)
+    found = estimator.settle(replace(nodes, position=place), [0, 1, 2])
+    assert found is not None and (found.segment_sigmas <= 0.08).tolist() == [True, False, True]
+    assert set(estimator.worlds) == {0, 2} and estimator.untold == {1}
+    assert estimator.worlds[2].scale == pytest.approx(SCALE / OTHER.scale, rel=0.05)
+
+
 def test_a_segment_before_the_one_that_is_aligned_takes_no_part() -> None:
     recording = record(11, seconds=14.0)
     estimator = InertialEstimator(InertialOptions())

@@ -154,6 +154,25 @@ def test_frames_after_a_dropped_keyframe_are_bridged_too() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("longest", [10.0, 0.1])
+def test_frames_of_a_segment_whose_scale_is_not_told_are_predicted_unless_it_is_long(longest: float) -> None:
+    odometry = tracker(replace(SMALL, inertial={"longest": longest}))
+    for k, frame in enumerate(with_samples(frames(16))):
+        odometry.track(frame)
+        if k == 9:
+            align(odometry, frame.timestamp)
+    for record in odometry.graph.log.frames[11:14]:
+        record.segment = 5
+    odometry.inertial.estimator.untold = {5}
+    result = odometry.finish()
+    stamps = [0.1 * k for k in range(11, 14)] if longest > 1 else []
+    np.testing.assert_allclose(result.inertial, stamps, atol=1e-9)
+    if longest > 1:
+        steps = np.diff(result.trajectory.positions[11:14], axis=0)
+        np.testing.assert_allclose(steps, np.tile(SPEED * 0.1, (2, 1)), atol=1e-6)
+
+
+@pytest.mark.long
 @pytest.mark.parametrize(("size", "error", "sigma", "taken"),
                          [(1.02, 1.0, 0.01, True), (1.02, 9.0, 0.01, False), (1.5, 1.0, 0.01, False),
                           (1.02, 1.0, 0.2, False), (1.02, 1.0, np.nan, False)])  # fmt: skip

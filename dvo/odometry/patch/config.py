@@ -34,7 +34,6 @@ on a CPU with instructions for it. ``auto``: int8 or bfloat16 on a CPU with inst
 InitialPose = Literal["motion", "nearest"]
 """First pose of a new frame: of the motion model, or from matches with the newest keyframe."""
 
-_BESIDE_SAMPLES = {"lifetime": 7, "removal": 9, "optimisation": 8}
 _RANGES = {
     "pixels": (0, 2**28),
     "patches": (1, 2**14),
@@ -86,8 +85,7 @@ class TrackerConfig:
             that leave the window finds too (:mod:`dvo.nets.patch.slopes`); 0: surfaces of constant depth.
         lifetime: largest distance, in frames, of the edges of a patch from its own frame.
         edges: frames up to this distance that a patch has edges into: ``all``, or ``spread``, the next four and every
-            second one of the others, so that as many edges see a point from places farther apart (docs/precision.md);
-            where inertial samples tell the scale, all up to 7 away.
+            second one of the others, so that as many edges see a point from places farther apart (docs/precision.md).
         removal: age, in frames, above which the edges of a frame's patches are archived.
         optimisation: number of newest frames whose poses are optimised.
         final_adjustment: solve for all frames of a segment at once in ``finish``
@@ -149,7 +147,7 @@ class TrackerConfig:
         DvoError: a value of the wrong type or out of range, with the name of the setting.
 
     Example:
-        >>> config = dvo.TrackerConfig(patches=48, optimisation=12)
+        >>> config = dvo.TrackerConfig(patches=48, optimisation=10)
         >>> odometry = dvo.load("small", config=config)
     """
 
@@ -160,10 +158,10 @@ class TrackerConfig:
     align_gain: float = 10.0
     align_reach: float = 0.3
     align_slope: float = 0.0
-    lifetime: int = 10
-    edges: Literal["all", "spread"] = "spread"
-    removal: int = 10
-    optimisation: int = 10
+    lifetime: int = 7
+    edges: Literal["all", "spread"] = "all"
+    removal: int = 9
+    optimisation: int = 8
     initial_frames: int = 5
     initial_updates: int = 16
     final_updates: int = 2
@@ -245,15 +243,6 @@ class TrackerConfig:
         every = range(1, self.lifetime + 1)
         return tuple(d for d in every if self.edges == "all" or d <= 4 or d % 2 == 0 or d == self.lifetime)
 
-    @cached_property
-    def beside_samples(self) -> TrackerConfig:
-        """Settings where inertial samples hold the unit: a window that is narrower follows them sooner, and poses as
-        they come stay nearer to metres (docs/inertial.md, "In the window")."""
-        if self.edges == "all":
-            return self
-        sizes = {name: min(getattr(self, name), most) for name, most in _BESIDE_SAMPLES.items()}
-        return replace(self, edges="all", **sizes)
-
     @property
     def aligned_motion(self) -> float:
         """Mean flow since the last frame of the network up to which frames are aligned, feature pixels."""
@@ -300,7 +289,6 @@ TRACKER_PRESETS: dict[str, TrackerConfig] = {
         pixels=0,
         patches=48,
         lifetime=11,
-        edges="all",
         removal=16,
         optimisation=7,
         initial_frames=8,

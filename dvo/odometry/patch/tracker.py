@@ -144,7 +144,7 @@ class PatchOdometry:
         ]
         self.inertial = InertialTracking(
             config.inertial, self.graph, metric=config.scale.source != "none", variance=config.variance,
-            optimised=config.beside_samples.optimisation,
+            optimised=config.optimisation,
         )  # fmt: skip
         self.patch_window = PatchWindow(self.network, self.window, config.measuring, self.device, self.sensors)
         self.aligner: FrameAlignment | None = None
@@ -158,11 +158,6 @@ class PatchOdometry:
     def window(self) -> Window:
         """Active keyframes and edges."""
         return self.graph.window
-
-    @property
-    def _settings(self) -> TrackerConfig:
-        """Settings, of a window that follows the samples where these hold its unit."""
-        return self.config.beside_samples if self.inertial.tells_scale else self.config
 
     @torch.inference_mode()
     def track(self, frame: Frame) -> Estimate:
@@ -398,7 +393,7 @@ class PatchOdometry:
 
     def _take(self, view: View) -> Estimate:
         """Add a frame with content to the window, and estimate its pose."""
-        window, config, state, record = self.window, self._settings, self.state, view.records[0]
+        window, config, state, record = self.window, self.config, self.state, view.records[0]
         if not state.initialised and (estimate := self._relocalise(view)):
             return estimate
         if not state.initialised:
@@ -435,7 +430,7 @@ class PatchOdometry:
         invite(self.patch_window, found.guests)
         graph.located = found.loop.old
         self.loops.relocalised(found.loop)
-        identifier, policy = self._name(view), self._settings.policies["located"]
+        identifier, policy = self._name(view), self.config.policies["located"]
         pose, depth = found.pose_cw.to(self.device, torch.float32), found.depths[None].to(self.device)
         self.patch_window.try_insert(view, len(self.window), identifier, pose, depth, policy)
         record.place(identifier, graph.segment, reason)
@@ -443,7 +438,7 @@ class PatchOdometry:
 
     def _initialise(self, view: View) -> Estimate:
         """Add a frame to a window that is not initialised yet, and try to initialise it."""
-        window, config, state, record = self.window, self._settings, self.state, view.records[0]
+        window, config, state, record = self.window, self.config, self.state, view.records[0]
         identifier, (pose, depth) = self._name(view), self._begin(view)
         self.patch_window.add(view, len(window), identifier, pose, depth)
         self.patch_window.connect(len(window) - 1, range(1, config.lifetime + 1))  # in few frames all tell
@@ -523,7 +518,7 @@ class PatchOdometry:
         """Refine the window and archive it; a segment that was never initialised has no rows."""
         keep = self.state.initialised
         for _ in range(self.config.final_updates if keep and len(self.window) > 1 else 0):
-            self.patch_window.update(self._settings.optimisation)
+            self.patch_window.update(self.config.optimisation)
         self.graph.begin_segment(self.state.keyframes, keep, NOT_INITIALISED)
         self.state.begin_segment()
 
@@ -546,7 +541,7 @@ class PatchOdometry:
 
     def _reduce(self) -> None:
         """Drop a redundant keyframe, and archive edges and keyframes beyond the maximum age."""
-        window, config = self.window, self._settings
+        window, config = self.window, self.config
         n, back = len(window), config.keyframe_index
         if self.state.initialised and n > back + max(1, window.guests):
             i, j = n - back - 1, n - back + 1

@@ -71,6 +71,8 @@ HARD = 0.05
 """Deviation of the acceleration, m/s^2, above which they follow each other after the alignment as before it."""
 ADJUST_DELAY, ADJUST_TOLERANCE = 10, 1e-3
 """Frames until its solution is taken, and its tolerance: with 1e-5 the scale differs by less than .1 %."""
+UNTOLD = "the samples do not tell the scale of these frames"
+"""Reason of a frame without a pose by its image, at the end, if none can be predicted either."""
 SAME_TIME = 1e-6
 """Seconds."""
 
@@ -614,6 +616,7 @@ class InertialTracking:
             if mine and mine[-1].timestamp - mine[0].timestamp <= self.options.longest:
                 for record in mine:
                     record.anchor, record.relative, record.lost, record.inertial = None, None, True, True
+                    record.reason = record.reason or UNTOLD
 
     def _fill(self, smoothed: Smoothed) -> None:
         """Poses of the frames that were bridged: predicted from the smoothed state before, and led to the one after."""

@@ -22,7 +22,7 @@ from dvo.odometry.global_ba.graph_adjustment import Adjusted
 from dvo.odometry.global_ba.inertial_adjustment import VisualInertialSolution as Solution
 from dvo.odometry.inertial.estimator import Similarity
 from dvo.odometry.inertial.smoother import Smoothed, spaced
-from dvo.odometry.patch.inertial import _led, _runs, _turns_of
+from dvo.odometry.patch.inertial import UNTOLD, _led, _runs, _turns_of
 from dvo.odometry.protocol import Estimate, ScaleState, Status
 from dvo.odometry.quality import Quality
 from tests.support.steady_samples import IDENTITY, SPEED, UPRIGHT, align, with_samples
@@ -177,6 +177,21 @@ def test_frames_of_a_segment_whose_scale_is_not_told_are_predicted_unless_it_is_
     if longest > 1:
         steps = np.diff(result.trajectory.positions[11:14], axis=0)
         np.testing.assert_allclose(steps, np.tile(SPEED * 0.1, (2, 1)), atol=1e-6)
+
+
+@pytest.mark.long
+def test_a_frame_that_cannot_be_predicted_either_is_lost_with_a_reason() -> None:
+    odometry = tracker()
+    for k, frame in enumerate(with_samples(frames(16))):
+        odometry.track(frame)
+        if k == 9:
+            align(odometry, frame.timestamp)
+    for record in odometry.graph.log.frames[:3]:  # nothing is known before them
+        record.segment = 5
+    odometry.inertial.estimator.untold = {5}
+    result = odometry.finish()
+    assert len(result.trajectory) == 13 and not len(result.inertial)
+    assert [entry.reason for entry in result.breaks] == [UNTOLD]
 
 
 @pytest.mark.long
